@@ -26,11 +26,25 @@ class Arrangement:
         groups: elements of each cemented group.
         stop: behind how many groups the stop stands.
         within: behind how many surfaces of the next group it stands, in glass; 0: in air.
+        terms: aspheric coefficients of each refracting surface, r⁴ first; (): spheres.
     """
 
     groups: tuple[int, ...]
     stop: int
     within: int = 0
+    terms: tuple[int, ...] = ()
+
+    @staticmethod
+    def of(specification: Specification, stop: int, within: int = 0) -> "Arrangement":
+        """Return that of a specification, with the stop in some place."""
+        bare = Arrangement(specification.groups, stop, within)
+        if not any(specification.asphere_terms):
+            return bare
+        terms, before = [], AIR
+        for behind in bare.media_behind:
+            terms.append(specification.element_terms[behind if before == AIR else before])
+            before = behind
+        return Arrangement(specification.groups, stop, within, tuple(terms))
 
     @cached_property
     def sequence(self) -> tuple[int, ...]:
@@ -77,8 +91,42 @@ class Arrangement:
 
     @property
     def variables(self) -> int:
-        """Return how many numbers tell a lens: curvatures, gaps and the sensor's distance."""
-        return self.surfaces + self.gaps + 1
+        """Return how many numbers tell a lens: curvatures, gaps, the sensor's distance, and the
+        coefficients of aspheres.
+        """
+        return self.image_column + 1 + sum(self.terms)
+
+    @property
+    def image_column(self) -> int:
+        """Return the column of the sensor's distance among the variables."""
+        return self.surfaces + self.gaps
+
+    def is_asphere(self, surface: int) -> bool:
+        """Return whether a refracting surface, from 0, is an asphere."""
+        return bool(self.terms) and self.terms[surface] > 0
+
+    @property
+    def aspheres(self) -> list[int]:
+        """Return the refracting surfaces that are aspheres, from 0."""
+        return [number for number in range(self.surfaces) if self.is_asphere(number)]
+
+    @cached_property
+    def coefficient_columns(self) -> tuple[range, ...]:
+        """Return the columns of each refracting surface's aspheric coefficients."""
+        found, first = [], self.image_column + 1
+        for terms in self.terms or (0,) * self.surfaces:
+            found.append(range(first, first + terms))
+            first += terms
+        return tuple(found)
+
+    @cached_property
+    def powers(self) -> tuple[int, ...]:
+        """Return the power of the length in each variable's unit: -1 of a curvature, 1 of a gap,
+        -3 of the coefficient of r⁴.
+        """
+        lengths = (1,) * (self.gaps + 1)
+        coefficients = [-(2 * n + 3) for terms in self.terms for n in range(terms)]
+        return (*(-1,) * self.surfaces, *lengths, *coefficients)
 
     @property
     def stop_place(self) -> int:
@@ -105,6 +153,8 @@ def template(arrangement: Arrangement, specification: Specification, wide: float
         shape: dict[str, Any] = {"type": "plane"}
         if place != STOP:
             shape = {"type": "sphere", "radius": 1e3 * wide}
+            if arrangement.terms and arrangement.terms[place]:
+                shape = asphere(1e-3 / wide, [0.0] * arrangement.terms[place])
         surfaces[str(number)] = {
             **shape,
             "semi_diameter": wide,
@@ -124,17 +174,34 @@ def template(arrangement: Arrangement, specification: Specification, wide: float
     )
 
 
+def asphere(curvature: float, coefficients: Sequence[float]) -> dict[str, Any]:
+    """Return an asphere of a search as a prescription has it.
+
+    Args:
+        curvature: 1/mm, not zero.
+        coefficients: of r⁴, r⁶, ..., in mm^(1 - power).
+    """
+    powers = {f"a{2 * n + 4}": value for n, value in enumerate(coefficients)}
+    return {"type": "even_asphere", "radius": 1.0 / curvature, "conic": -1.0, **powers}
+
+
 def _medium(element: int, specification: Specification) -> str:
     return "air" if element == AIR else specification.element_glasses[element]
 
 
 def parameter_names(arrangement: Arrangement) -> Sequence[str]:
     """Return the parameters of the template that vary: curvatures, then the distance from the
-    plane of the entrance pupil to the first of the sequence, then gaps and the sensor's distance.
+    plane of the entrance pupil to the first of the sequence, then gaps, the sensor's distance and
+    the coefficients of aspheres.
     """
     curved = [n for n, place in enumerate(arrangement.sequence, 2) if place != STOP]
     return [
         *(f"surfaces.{number}.curvature" for number in curved),
         "thicknesses.*",
         "sensor_distance",
+        *(
+            f"surfaces.{number}.a{2 * n + 4}"
+            for number, terms in zip(curved, arrangement.terms, strict=False)
+            for n in range(terms)
+        ),
     ]

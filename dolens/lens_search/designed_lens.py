@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import AIR, STOP, Arrangement
+from dolens.lens_search.arrangement import AIR, STOP, Arrangement, asphere
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.real_pupils import stop_radii, with_real_beams
 from dolens.lens_search.specification import Specification
@@ -50,9 +50,14 @@ def designed_lens(
             height = abs(float(found.marginal[number] + zero)) * radius
             height += abs(float(found.chief[number] + zero)) * field
             height *= float(conditions.beam[0, number])
-            row = {"type": "plane"} if curvature == 0.0 else {"type": "sphere"}
-            if curvature != 0.0:
-                row["radius"] = 1.0 / curvature
+            row = {"type": "plane"}
+            if arrangement.is_asphere(number):
+                terms = enumerate(numbers.coefficients[number])
+                row = asphere(
+                    curvature or 1e-12 / f, [float(a) / f ** (2 * n + 3) for n, a in terms]
+                )
+            elif curvature != 0.0:
+                row = {"type": "sphere", "radius": 1.0 / curvature}
                 height = min(height, 0.99 / abs(curvature) / _MARGIN)
             row["semi_diameter"] = _MARGIN * height
         if gaps[place] is not None:

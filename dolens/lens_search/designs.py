@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import STOP, Arrangement
-from dolens.lens_search.form_coordinates import FormArrays, form_coordinates
+from dolens.lens_search.form_coordinates import ZONES, FormArrays, departures, form_coordinates
 from dolens.lens_search.forms import TOLERANCE, form_numbers
 from dolens.lens_search.merit import SearchMerit
+from dolens.lens_search.paraxial import LensNumbers
 
 
 @dataclass(frozen=True)
@@ -91,16 +92,19 @@ class Designs:
         radius = 0.5 / merit.specification.f_number
         field = float(merit.rays.tangent.max())
         zero = torch.zeros_like(numbers.image)
-        curvatures, heights, indices = [], [], [zero + 1.0]
+        curvatures, heights, bent, indices = [], [], [], [zero + 1.0]
+        none = torch.stack([zero] * len(ZONES), -1)
         behind = zero + 1.0
         for place in a.sequence:
             if place == STOP:
                 curvatures.append(zero)
                 heights.append(zero)
+                bent.append(none)
             else:
                 curvatures.append(numbers.curvatures[place])
                 height = radius * abs(found.marginal[place]) + field * abs(found.chief[place])
                 heights.append(zero + height)
+                bent.append(self._departures(numbers, place, zero + height))
                 behind = zero + numbers.indices[place + 1]
             indices.append(behind)
         return FormArrays(
@@ -109,8 +113,20 @@ class Designs:
             torch.stack(indices, -1),
             torch.stack(heights, -1),
             1.0 / found.power,
+            departures=torch.stack(bent, 1) if a.aspheres else None,
             stop=a.stop_place + 1,
         )
+
+    def _departures(self, numbers: LensNumbers, surface: int, height: Tensor) -> Tensor:
+        """Return a surface's departures from its vertex spheres, (n, zones)."""
+        if not self.arrangement.is_asphere(surface):
+            return torch.zeros((len(height), len(ZONES)), dtype=torch.float64)
+        r = height[:, None] * torch.tensor(ZONES, dtype=torch.float64)
+        curvature = numbers.curvatures[surface][:, None]
+        sag = 0.5 * curvature * r.square()
+        for order, number in enumerate(numbers.coefficients[surface], 2):
+            sag = sag + number[:, None] * r ** (2 * order)
+        return departures(sag, curvature.expand_as(r), r)
 
 
 def element_powers(arrangement: Arrangement, values: Tensor, merit: SearchMerit) -> Tensor:

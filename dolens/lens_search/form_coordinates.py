@@ -36,7 +36,7 @@ _PLANE = 0.01
 _SAME, _AIR = 1e-9, 1.1
 _DISPERSION = 10.0
 # Shares of the beam's height at which an asphere's departure from its vertex sphere is taken.
-_ZONES = (0.75, 1.0)
+ZONES = (0.75, 1.0)
 # Magnifications this near to 1 or -1 are equal to it.
 _UNIT_MAGNIFICATION = 0.01
 
@@ -197,7 +197,7 @@ def _check(arrays: FormArrays) -> None:
         "heights": (arrays.heights, (count, surfaces)),
         "focal_lengths": (arrays.focal_lengths, (count,)),
         "dispersions": (arrays.dispersions, (count, surfaces + 1)),
-        "departures": (arrays.departures, (count, surfaces, len(_ZONES))),
+        "departures": (arrays.departures, (count, surfaces, len(ZONES))),
     }
     for name, (value, shape) in expected.items():
         if value is not None and tuple(value.shape) != shape:
@@ -279,9 +279,17 @@ def _departure(surface: SurfaceState, curvature: float, height: Tensor) -> Tenso
     the radius of each.
     """
     reach = min(float(height), surface.semi_diameter)
-    y = reach * torch.tensor(_ZONES, dtype=torch.float64)
+    y = reach * torch.tensor(ZONES, dtype=torch.float64)
     sag, _, _, exists = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(y), y)
-    square = (curvature * y).square()
-    sphere = curvature * y.square() / (1.0 + (1.0 - square).clamp(min=0.0).sqrt())
-    real = square < 1.0 if exists is None else (square < 1.0) & (exists > 0.0)
-    return torch.where(real, 2.0 * (sag - sphere) / y, 0.0)
+    real = torch.ones_like(y, dtype=torch.bool) if exists is None else exists > 0.0
+    return torch.where(real, departures(sag, torch.full_like(y, curvature), y), 0.0)
+
+
+def departures(sag: Tensor, curvature: Tensor, radius: Tensor) -> Tensor:
+    """Return how far surfaces depart from their vertex spheres at a radius, over half of it; zero
+    where the sphere has ended, or at the vertex.
+    """
+    square = (curvature * radius).square()
+    sphere = curvature * radius.square() / (1.0 + (1.0 - square).clamp(min=0.0).sqrt())
+    there = (square < 1.0) & (radius > 0.0)
+    return torch.where(there, 2.0 * (sag - sphere) / radius, 0.0)

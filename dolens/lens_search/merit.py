@@ -1,9 +1,11 @@
 """The merit of many lenses: RMS spots about their centroids, and operands for the specification.
 
-Variables u are curvatures times the focal length f, and gaps and the sensor's distance over f, so
-that one is like the other.  The merit is Σ_fields ω·(RMS spot/f)² + Σ (weight·deviation)².
+Variables u are curvatures times the focal length f, gaps and the sensor's distance over f, and the
+coefficients of aspheres likewise in units of f.  The merit is Σ_fields ω·(RMS spot/f)² +
+Σ (weight·deviation)².
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -22,6 +24,8 @@ from dolens.optimize.batch_least_squares import BatchModel
 # Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
 # curved surface leaves it by the step's square: weights near one leave steps no room.
 OPERAND_WEIGHT = 0.03
+# Of one term of an asphere, over the focal length.
+_MOST_BEND = 2.0
 # Limits are aimed at from within: the rays that a lens is checked with lie between those here.
 _WITHIN = 0.999
 
@@ -132,12 +136,17 @@ class SearchMerit:
         one = torch.ones(1, dtype=torch.float64)
         beam = torch.ones((1, self.arrangement.surfaces + 1), dtype=torch.float64)
         _, _, limits = self._paraxial_operands(u, one, one, beam)
-        return torch.tensor([*limits, *([True] * self._distortions)])
+        return torch.tensor([*limits, *([True] * (self._distortions + self._chief_ray_angles))])
 
     @property
     def _distortions(self) -> int:
         """Return the number of operands that hold the distortion."""
-        return 0 if self.specification.limits.distortion is None else self.rays.fields - 1
+        return 0 if self.specification.limits.distortion is None else self.rays.chiefs
+
+    @property
+    def _chief_ray_angles(self) -> int:
+        """Return the number of operands that hold the angles of chief rays at the sensor."""
+        return 0 if self.specification.limits.chief_ray_angle is None else self.rays.chiefs
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the box of the variables u, (P,) each."""
@@ -154,6 +163,11 @@ class SearchMerit:
             upper.append(2.0 if high is None else high / f)
         lower.append(limits.back_focus / f)
         upper.append(3.0)
+        # A single term bends the edge of the axial beam at the entrance pupil by so much at most.
+        axial = 0.5 / self.specification.f_number
+        widest = [_MOST_BEND / axial ** (1 - power) for power in a.powers[a.image_column + 1 :]]
+        lower += [-most for most in widest]
+        upper += widest
         return (
             torch.tensor(lower, dtype=torch.float64),
             torch.tensor(upper, dtype=torch.float64),
@@ -169,7 +183,14 @@ class SearchMerit:
             pupil: from the first of the sequence to the entrance pupil over f, (L,).
         """
         f, s = self.specification.focal_length, self.arrangement.surfaces
-        return torch.cat([u[:, :s] / f, -pupil[:, None] * f, u[:, s:] * f], 1)
+        lens = u[:, : self.arrangement.variables] * self.scales[: self.arrangement.variables]
+        return torch.cat([lens[:, :s], -pupil[:, None] * f, lens[:, s:]], 1)
+
+    @cached_property
+    def scales(self) -> Tensor:
+        """Return what variables u are multiplied by to be those of the family, mm, (P,)."""
+        powers = torch.tensor(self.arrangement.powers, dtype=torch.float64)
+        return self.specification.focal_length**powers
 
     def lens_numbers(self, u: Tensor) -> LensNumbers:
         """Return the numbers of lenses u (L, P), with derivatives with respect to u."""
@@ -193,11 +214,11 @@ class SearchMerit:
     def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
         """Return the models of lenses u (L, P), in units of f; no merit where a ray fails."""
         found = self._evaluate(u, conditions)
-        f, surfaces = self.specification.focal_length, self.arrangement.surfaces
+        f = self.specification.focal_length
         shifted = found.deviations + conditions.shifts
         shifted = torch.where(self.is_limit, shifted.clamp(min=0.0), shifted)
         rows = torch.where((shifted != 0.0)[..., None], found.derivatives, 0.0)
-        spots = _in_variables(_about_centroids(found.sums), found.of_pupil, f, surfaces)
+        spots = self._in_variables(_about_centroids(found.sums), found.of_pupil)
         weight = self.operand_weight**2
         merit = spots.merit / f**2 + weight * shifted.square().sum(-1)
         return BatchModel(
@@ -221,7 +242,7 @@ class SearchMerit:
         pupil, of_pupil = first_order[:, 0], of_first_order[:, 0]
         rays, tangent = self._launched(conditions)
         by_group = torch.nn.functional.pad(
-            conditions.field_weights, (0, self.rays.fields - 1), value=1.0
+            conditions.field_weights, (0, self.rays.chiefs), value=1.0
         )
         sums = self.family.normal_equations(
             self.lens_values(u, pupil),
@@ -235,6 +256,10 @@ class SearchMerit:
         limit = self.specification.limits.distortion
         if limit is not None and self._distortions:
             deviation, row = self._distortion(sums, tangent, of_pupil, limit)
+            deviations.append(deviation)
+            rows.append(row)
+        if self._chief_ray_angles:
+            deviation, row = self._chief_ray_angle(u, pupil, of_pupil, rays)
             deviations.append(deviation)
             rows.append(row)
         usable = (sums.count == tangent.shape[1]) & torch.isfinite(pupil)
@@ -285,14 +310,48 @@ class SearchMerit:
     def _distortion(
         self, sums: FamilySums, tangent: Tensor, of_pupil: Tensor, limit: float
     ) -> tuple[Tensor, Tensor]:
-        """Return how far distortion exceeds its limit (L, F - 1), and derivatives (L, F - 1, P)."""
-        f, s = self.specification.focal_length, self.arrangement.surfaces
+        """Return how far distortion exceeds its limit (L, C), and derivatives (L, C, P)."""
+        f = self.specification.focal_length
         fields = self.rays.fields
-        ideal = f * tangent[:, -(fields - 1) :]
+        ideal = f * tangent[:, -self.rays.chiefs :]
         share = sums.group_residual[:, fields:, 1] / ideal
         row = sums.group_jacobian[:, fields:, 1] / ideal[..., None]
-        row = _row_in_variables(row, of_pupil[:, None], f, s)
+        row = self._row_in_variables(row, of_pupil[:, None])
         return share.abs() - _WITHIN * limit, share.sign()[..., None] * row
+
+    def _chief_ray_angle(
+        self, u: Tensor, pupil: Tensor, of_pupil: Tensor, rays: FamilyRays
+    ) -> tuple[Tensor, Tensor]:
+        """Return by how much the sines of chief rays' angles at the sensor exceed their limit
+        (L, C), and derivatives (L, C, P).
+        """
+        count = self._chief_ray_angles
+        chief = FamilyRays(
+            rays.position[:, -count:], rays.direction[:, -count:], self.rays.wavelength[-count:]
+        )
+        found = self.family.jacobians(self.lens_values(u, pupil), chief, ("m",))
+        sine = found.values[:, 0]
+        row = self._row_in_variables(found.derivatives[:, 0].mT, of_pupil[:, None])
+        limit = self.specification.limits.chief_ray_angle
+        assert limit is not None  # it is counted
+        most = math.sin(math.radians(_WITHIN * limit))
+        return sine.abs() - most, sine.sign()[..., None] * row
+
+    def _row_in_variables(self, row: Tensor, of_pupil: Tensor) -> Tensor:
+        """Return derivatives (..., L, P) with respect to u from those (..., L, P + 1) with respect
+        to the family's variables.
+        """
+        f, s = self.specification.focal_length, self.arrangement.surfaces
+        own = torch.cat([row[..., :s], row[..., s + 1 :]], -1) * self.scales
+        return own - f * row[..., s : s + 1] * of_pupil
+
+    def _in_variables(self, model: BatchModel, of_pupil: Tensor) -> BatchModel:
+        """Return the model in u of one in the family's variables, with the pupil's distance
+        following from u.
+        """
+        first = self._row_in_variables(model.hessian, of_pupil[:, None])
+        both = self._row_in_variables(first.mT, of_pupil[:, None])
+        return BatchModel(model.merit, self._row_in_variables(model.gradient, of_pupil), both)
 
 
 @dataclass(frozen=True)
@@ -321,24 +380,6 @@ def _about_centroids(sums: FamilySums) -> BatchModel:
         sums.jtr - torch.einsum("lg,lgp->lp", mean, jacobian),
         sums.jtj - torch.einsum("lgp,lgq->lpq", scaled, scaled),
     )
-
-
-def _row_in_variables(row: Tensor, of_pupil: Tensor, f: float, surfaces: int) -> Tensor:
-    """Return derivatives (..., L, P) with respect to u from those (..., L, P + 1) with respect to
-    the family's variables.
-    """
-    pupil = row[..., surfaces : surfaces + 1]
-    own = torch.cat([row[..., :surfaces] / f, row[..., surfaces + 1 :] * f], -1)
-    return own - f * pupil * of_pupil
-
-
-def _in_variables(model: BatchModel, of_pupil: Tensor, f: float, surfaces: int) -> BatchModel:
-    """Return the model in u of one in the family's variables, with the pupil's distance following
-    from u.
-    """
-    first = _row_in_variables(model.hessian, of_pupil[:, None], f, surfaces)
-    both = _row_in_variables(first.mT, of_pupil[:, None], f, surfaces)
-    return BatchModel(model.merit, _row_in_variables(model.gradient, of_pupil, f, surfaces), both)
 
 
 @lru_cache(maxsize=64)

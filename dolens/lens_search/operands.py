@@ -4,6 +4,7 @@ An operand's deviation is zero where it holds; of a limit it is negative where t
 Lengths are in units of the focal length.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -11,11 +12,12 @@ from torch import Tensor
 
 from dolens.lens_search.arrangement import AIR, Arrangement
 from dolens.lens_search.paraxial import LensNumbers, Paraxial
+from dolens.lens_search.sags import asphere_slopes, sags
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
 
-# Beyond this part of a hemisphere the sag is continued along its tangent, to stay finite.
-_STEEP = 0.98
+# Shares of the beam's height at which aspheres, and the spaces beside them, are looked at.
+_ZONES = (0.4, 0.6, 0.8, 0.9, 1.0)
 
 
 def paraxial_operands(
@@ -47,17 +49,25 @@ def paraxial_operands(
     marginal = Tangents.stacked([zero + height for height in first_order.marginal])
     chief = Tangents.stacked(first_order.chief)
     heights = (marginal.abs() * aperture + chief.abs() * field) * beam.T[:-1]
-    found.append((curvatures * heights).abs() - limits.aperture_over_radius)
-    # Neighbouring surfaces do not come too near at the edge of the beam.
+    spheres = [n for n in range(arrangement.surfaces) if not arrangement.is_asphere(n)]
+    if spheres:
+        steep = (curvatures[spheres] * heights[spheres]).abs()
+        found.append(steep - limits.aperture_over_radius)
+    if arrangement.aspheres:
+        found.append(_slopes(arrangement, lenses, heights, limits.slope))
+    # Neighbouring surfaces do not come too near in the beam, or at its edge.
     spaces = list(_spaces(arrangement))
-    before, behind = [n for n, _ in spaces], [n + 1 for n, _ in spaces]
-    height = heights[before].maximum(heights[behind])
     thickness = Tangents.stacked([_sum([lenses.gaps[g] for g in gaps]) for _, gaps in spaces])
-    edge = thickness + _sag(curvatures[behind], height) - _sag(curvatures[before], height)
     least = [
-        limits.air_edge if arrangement.media_behind[n] == AIR else limits.glass_edge for n in before
+        limits.air_edge if arrangement.media_behind[n] == AIR else limits.glass_edge
+        for n, _ in spaces
     ]
-    found.append(torch.tensor(least, dtype=torch.float64)[:, None] / f - edge)
+    least_over_f = torch.tensor(least, dtype=torch.float64)[:, None] / f
+    for zone in _ZONES if arrangement.aspheres else _ZONES[-1:]:
+        before, behind = _at_edge(arrangement, heights, [n for n, _ in spaces], zone)
+        sag = sags(arrangement, lenses, [n for n, _ in spaces], before)
+        next_sag = sags(arrangement, lenses, [n + 1 for n, _ in spaces], behind)
+        found.append(least_over_f - (thickness + next_sag - sag))
     stop = arrangement.stop_place
     widest = limits.glass[1] if arrangement.within else limits.air[1]
     if widest is not None and 0 < stop < len(arrangement.sequence) - 1:
@@ -67,9 +77,14 @@ def paraxial_operands(
     opening = Tangents.stacked([zero + first_order.stop_height]).abs() * (aperture * beam[:, -1])
     for neighbour, side in ((stop - 1, -1.0), (stop + 1, 1.0)):
         if 0 <= neighbour < len(arrangement.sequence):
-            sag = _sag(curvatures[[arrangement.sequence[neighbour]]], opening)
+            sag = sags(arrangement, lenses, [arrangement.sequence[neighbour]], opening)
             gap = Tangents.stacked([lenses.gaps[min(neighbour, stop)]])
             found.append(limits.air_edge / f - (gap + side * sag))
+    last = arrangement.surfaces - 1
+    if arrangement.is_asphere(last):
+        # An asphere's edge may come nearer to the sensor than its vertex.
+        sag = sags(arrangement, lenses, [last], heights[[last]])
+        found.append(limits.air_edge / f - (Tangents.stacked([lenses.image]) - sag))
     every = Tangents(torch.cat([part.rows for part in found]))
     return every, [False] + [True] * (len(every.rows) - 1)
 
@@ -88,14 +103,30 @@ def _sum(gaps: Sequence[Tangents]) -> Tangents:
     return total
 
 
-def _sag(curvature: Tangents, height: Tangents) -> Tangents:
-    """Return the sag of a sphere at a height; beyond its steep part that of the tangent there."""
-    steep = curvature * height
-    inside = steep.clamp(-_STEEP, _STEEP)
-    root = (1.0 - inside * inside).sqrt()
-    sag = inside / (root + 1.0)
-    beyond = steep - inside
-    if bool((beyond.value != 0.0).any()):
-        slope = 1.0 / (root.value * (1.0 + root.value))
-        sag = sag + beyond * slope
-    return height * sag
+def _at_edge(
+    arrangement: Arrangement, heights: Tangents, surfaces: Sequence[int], zone: float
+) -> tuple[Tangents, Tangents]:
+    """Return the heights on surfaces and on those behind them at a share of the way to the edge.
+
+    Spheres go on to the higher of the two beams.  An asphere ends with its beam, and is flat from
+    there; glass reaches to the higher of its two beams, and air is looked at up to the lower one.
+    """
+    own, other = heights[list(surfaces)], heights[[n + 1 for n in surfaces]]
+    higher = own.maximum(other)
+    if not arrangement.aspheres:
+        return higher, higher
+    lower = -(-own).maximum(-other)
+    glass = torch.tensor([arrangement.media_behind[n] != AIR for n in surfaces])[:, None, None]
+    edge = zone * Tangents(torch.where(glass, higher.rows, lower.rows))
+    return -(-edge).maximum(-own), -(-edge).maximum(-other)
+
+
+def _slopes(
+    arrangement: Arrangement, lenses: LensNumbers, heights: Tangents, limit: float
+) -> Tangents:
+    """Return how much steeper aspheres are than a limit, degrees, as shares of its tangent."""
+    surfaces = arrangement.aspheres
+    at = heights[surfaces]
+    most = math.tan(math.radians(limit))
+    found = [asphere_slopes(arrangement, lenses, surfaces, zone * at) for zone in _ZONES]
+    return Tangents(torch.cat([part.rows for part in found])).abs() / most - 1.0

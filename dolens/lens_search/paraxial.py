@@ -20,12 +20,14 @@ class LensNumbers:
         gaps: G between neighbours of the sequence.
         image: from the last of the sequence to the sensor.
         indices: S + 1 of them: in front of the lens and behind each refracting surface.
+        coefficients: of each refracting surface, r⁴ first; none of a sphere.
     """
 
     curvatures: Sequence[Number]
     gaps: Sequence[Number]
     image: Number
     indices: Sequence[Number]
+    coefficients: Sequence[Sequence[Number]] = ()
 
 
 @dataclass(frozen=True)
@@ -58,11 +60,12 @@ def numbers_of(
 
     Args:
         arrangement: the order.
-        variables: curvatures, gaps and the sensor's distance.
+        variables: curvatures, gaps, the sensor's distance and the coefficients of aspheres.
         indices: at the reference wavelength, as in `LensNumbers`.
     """
     s, g = arrangement.surfaces, arrangement.gaps
-    return LensNumbers(variables[:s], variables[s : s + g], variables[s + g], indices)
+    coefficients = [[variables[n] for n in own] for own in arrangement.coefficient_columns]
+    return LensNumbers(variables[:s], variables[s : s + g], variables[s + g], indices, coefficients)
 
 
 def paraxial(arrangement: Arrangement, lenses: LensNumbers) -> Paraxial:

@@ -118,7 +118,7 @@ def start_tasks(specification: Specification, plan: SearchPlan) -> list[StartTas
 def grown_starts(specification: Specification, plan: SearchPlan, task: StartTask) -> Step:
     """Grow one batch of starts, and finish the better ones."""
     stop, first, count = task
-    arrangement = Arrangement(specification.groups, *stop)
+    arrangement = Arrangement.of(specification, *stop)
     merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
     generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
     starts = random_starts(merit, count, generator, plan.drawn)

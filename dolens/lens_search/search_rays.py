@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -14,8 +15,9 @@ from dolens.lens_search.specification import Specification
 class SearchRays:
     """What the rays of all lenses share.  F fields, N rays.
 
-    A group is the light of one field of all wavelengths; then comes a group for the chief ray of
-    each field but the first, at the reference wavelength.
+    A group is the light of one field of all wavelengths.  Then come groups of one ray each: chief
+    rays at the reference wavelength, of the fields but the first and of those halfway to them from
+    the one before, since distortion is greatest anywhere.
 
     Attributes:
         pupil: (N, 2), in radii of the entrance pupil, x ≥ 0.
@@ -23,8 +25,9 @@ class SearchRays:
         weight: (N,), of spots: they sum to one over each group; of chief rays 1.
         group: (N,), int64.
         wavelength: (N,), int32.
-        field: (N,), int64, which of the fields.
+        field: (N,), int64, which of the fields; of a chief ray between two the outer one.
         fields: F.
+        chiefs: C chief rays.
     """
 
     pupil: Tensor
@@ -34,11 +37,12 @@ class SearchRays:
     wavelength: Tensor
     field: Tensor
     fields: int
+    chiefs: int
 
     @property
     def groups(self) -> int:
         """Return the number of groups."""
-        return 2 * self.fields - 1
+        return self.fields + self.chiefs
 
 
 def half_pupil(rings: int, arms: int) -> tuple[Tensor, Tensor]:
@@ -80,21 +84,26 @@ def search_rays(specification: Specification, rings: int = 4, arms: int = 8) -> 
             wavelength.append(torch.full((len(points),), wave, dtype=torch.int32))
     middle = torch.zeros((1, 2), dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)
-    for number, slope in enumerate(tangents[1:], fields):
-        pupil.append(middle)
-        weight.append(one)
-        tangent.append(slope * one)
-        group.append(torch.full((1,), number))
-        wavelength.append(torch.full((1,), specification.reference, dtype=torch.int32))
-    every = torch.cat(group)
+    owner = [torch.cat(group)]
+    chiefs = 0
+    for outer, (before, slope) in enumerate(pairwise(tangents), 1):
+        for between in (0.5 * (before + slope), slope):
+            pupil.append(middle)
+            weight.append(one)
+            tangent.append(between * one)
+            group.append(torch.full((1,), fields + chiefs))
+            owner.append(torch.full((1,), outer))
+            wavelength.append(torch.full((1,), specification.reference, dtype=torch.int32))
+            chiefs += 1
     return SearchRays(
         torch.cat(pupil),
         torch.cat(tangent),
         torch.cat(weight),
-        every,
+        torch.cat(group),
         torch.cat(wavelength),
-        torch.where(every < fields, every, every - fields + 1),
+        torch.cat(owner),
         fields,
+        chiefs,
     )
 
 

@@ -8,6 +8,8 @@ from dolens.errors import InputError
 
 # No limit.
 Limit = float | None
+# Coefficients of an asphere at most, r⁴ to r¹⁸.
+MOST_TERMS = 8
 
 
 @dataclass(frozen=True)
@@ -21,9 +23,10 @@ class Limits:
         air_edge: least air space there.
         back_focus: least distance from the last vertex to the sensor.
         track: greatest distance from the first surface, or a stop in front of it, to the sensor.
+        slope: greatest angle of an asphere within the beam with the plane across the axis, degrees.
         distortion: greatest |h/h₀ - 1| of the chief ray's height h at the sensor, h₀ = f·tan θ.
         chief_ray_angle: greatest angle of the chief ray with the sensor's normal, degrees.
-        aperture_over_radius: greatest ratio of the beam's height on a surface to its radius.
+        aperture_over_radius: greatest ratio of the beam's height on a sphere to its radius.
     """
 
     glass: tuple[float, float] = (2.0, 120.0)
@@ -35,6 +38,7 @@ class Limits:
     distortion: Limit = 0.01
     chief_ray_angle: Limit = None
     aperture_over_radius: float = 0.95
+    slope: float = 60.0
 
     def __post_init__(self) -> None:
         for name in ("glass", "air"):
@@ -51,6 +55,8 @@ class Limits:
                 f"limits.aperture_over_radius must lie between 0 and 1, "
                 f"not {self.aperture_over_radius}"
             )
+        if not 0.0 < self.slope < 90.0:
+            raise InputError(f"limits.slope must lie between 0 and 90 degrees, not {self.slope}")
         if not self.back_focus >= 0.0:
             raise InputError(f"limits.back_focus must be 0 or more, not {self.back_focus}")
 
@@ -70,6 +76,9 @@ class Specification:
         stops: behind how many groups the stop may stand, in air; 0 is in front of the lens.
         stop_in_glass: whether it may stand within any element too, as a ring let into it.
         glasses: of each element, as a prescription names them; a single one is that of all.
+        asphere_terms: coefficients of r⁴, r⁶, ... of both surfaces of each element; a single number
+            is that of all, 0 for spheres.  A cemented surface has those of the element in front of
+            it.  An asphere's conic constant is -1: its sag is a polynomial, wherever the beam goes.
         limits: what must be kept.
     """
 
@@ -82,11 +91,12 @@ class Specification:
     stops: tuple[int, ...] = ()
     reference_wavelength: float | None = None
     stop_in_glass: bool = False
+    asphere_terms: tuple[int, ...] = (0,)
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
         # Lists, as files give them, become tuples.
-        for name in ("fields", "wavelengths", "groups", "glasses", "stops"):
+        for name in ("fields", "wavelengths", "groups", "glasses", "stops", "asphere_terms"):
             object.__setattr__(self, name, tuple(getattr(self, name) or ()))
         for name in ("focal_length", "f_number"):
             if not 0.0 < getattr(self, name) < math.inf:
@@ -109,6 +119,15 @@ class Specification:
                 f"glasses: one for all or {self.elements}, one for each element, "
                 f"not {len(self.glasses)}"
             )
+        if len(self.asphere_terms) not in (1, self.elements):
+            raise InputError(
+                f"asphere_terms: one for all or {self.elements}, one for each element, "
+                f"not {len(self.asphere_terms)}"
+            )
+        if not all(0 <= terms <= MOST_TERMS for terms in self.asphere_terms):
+            raise InputError(
+                f"asphere_terms: from 0 to {MOST_TERMS} each, not {list(self.asphere_terms)}"
+            )
         wrong = [stop for stop in self.stops if not 0 <= stop <= len(self.groups)]
         if wrong:
             raise InputError(f"stops: from 0 to {len(self.groups)}, not {wrong[0]}")
@@ -122,6 +141,11 @@ class Specification:
     def element_glasses(self) -> tuple[str, ...]:
         """Return the glass of each element."""
         return self.glasses * (self.elements // len(self.glasses))
+
+    @property
+    def element_terms(self) -> tuple[int, ...]:
+        """Return the number of aspheric coefficients of each element's surfaces."""
+        return self.asphere_terms * (self.elements // len(self.asphere_terms))
 
     @property
     def places_of_stop(self) -> tuple[tuple[int, int], ...]:

@@ -60,8 +60,10 @@ def _drawn(merit: SearchMerit, count: int, generator: torch.Generator) -> Tensor
         low = max(float(lower[gap]), 1e-3)
         high = min(float(upper[gap]), 0.3 if medium != AIR else 0.4)
         columns.append(logarithmic(low, max(high, 1.001 * low)))
-    low = max(float(lower[-1]), 0.05)
+    low = max(float(lower[arrangement.image_column]), 0.05)
     columns.append(uniform(low, max(1.2, 1.5 * low)))
+    # Aspheres begin as parabolas.
+    columns += [torch.zeros(count, dtype=torch.float64)] * sum(arrangement.terms)
     return torch.stack(columns, -1)
 
 
@@ -87,9 +89,9 @@ def _with_focal_length(merit: SearchMerit, drawn: Tensor) -> Tensor:
     found[at_new.abs() > 1e-3] = torch.nan
     back_focus = merit.paraxial_of(found)[2]
     lower, upper = merit.bounds()
-    found[:, -1] = torch.where(
-        (back_focus >= lower[-1]) & (back_focus <= upper[-1]), back_focus, torch.nan
-    )
+    image = merit.arrangement.image_column
+    within = (back_focus >= lower[image]) & (back_focus <= upper[image])
+    found[:, image] = torch.where(within, back_focus, torch.nan)
     return found
 
 
@@ -115,5 +117,6 @@ def _rank(merit: SearchMerit, lenses: Tensor) -> Tensor:
     limit = specification.limits.track
     if limit is not None:
         s = merit.arrangement.surfaces
-        good &= lenses[:, s:].sum(-1) < limit / specification.focal_length
+        lengths = lenses[:, s : merit.arrangement.image_column + 1]
+        good &= lengths.sum(-1) < limit / specification.focal_length
     return torch.where(good & torch.isfinite(strain), strain, torch.inf)

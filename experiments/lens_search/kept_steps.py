@@ -80,6 +80,7 @@ class KeptSteps:
                     "groups": list(designs.arrangement.groups),
                     "stop": designs.arrangement.stop,
                     "within": designs.arrangement.within,
+                    "terms": list(designs.arrangement.terms),
                     "values": designs.values,
                     "spots": designs.spots,
                     "violation": designs.violation,
@@ -102,7 +103,9 @@ class KeptSteps:
         self.seconds_before = max(self.seconds_before, float(plain["seconds"]))
         designs = tuple(
             Designs(
-                Arrangement(tuple(part["groups"]), part["stop"], part["within"]),
+                Arrangement(
+                    tuple(part["groups"]), part["stop"], part["within"], tuple(part["terms"])
+                ),
                 part["values"],
                 part["spots"],
                 part["violation"],

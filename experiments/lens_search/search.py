@@ -144,7 +144,7 @@ class LensSearchModule(Analysis):
 
 def first_start(specification: Specification) -> Lens:
     """Return the most promising of a few starts as a lens: what a run keeps as its initial lens."""
-    arrangement = Arrangement(specification.groups, *specification.places_of_stop[0])
+    arrangement = Arrangement.of(specification, *specification.places_of_stop[0])
     merit = SearchMerit.of(arrangement, specification, STAGES[0].rings, STAGES[0].arms)
     generator = torch.Generator().manual_seed(0)
     starts = random_starts(merit, 20, generator)

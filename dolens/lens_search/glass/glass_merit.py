@@ -4,6 +4,7 @@ Variables are those of the lens, as `SearchMerit` has them, and then C coordinat
 each element.  Some glasses of a lens may be real ones: their indices are those of the catalogue.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +19,7 @@ from dolens.lens_search.glass.region import GlassRegion
 from dolens.lens_search.merit import Conditions, SearchMerit
 from dolens.lens_search.paraxial import LensNumbers, numbers_of
 from dolens.lens_search.tangents import Tangents
-from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
+from dolens.optics.lens_family import FamilyJacobian, FamilyRays, FamilySums, LensFamily
 from dolens.optics.rays import TracedRays
 from dolens.optimize.batch_least_squares import BatchModel
 
@@ -110,8 +111,7 @@ class GlassMerit:
         variables = family.with_indices(
             rows.repeat_interleave(count), columns, family.count + elements * count
         )
-        # Lengths of the family are f times those of u, and its columns are divided by that.
-        by_length = slopes.repeat(len(media), 1) / base.specification.focal_length
+        by_index = slopes.repeat(len(media), 1)
         here = _LensesOfGlasses(
             base.arrangement,
             base.specification,
@@ -121,13 +121,19 @@ class GlassMerit:
             slopes[:, base.specification.reference],
         )
         traced = _FamilyOfGlasses(
-            family, indices, variables, by_length.expand(len(u), -1, -1).contiguous()
+            family, indices, variables, by_index.expand(len(u), -1, -1).contiguous()
         )
         behind = [
             n[:, m, base.specification.reference] if m != AIR else air.expand(len(u))
             for m, air in zip((AIR, *arrangement.media_behind), base.indices, strict=True)
         ]
-        here.__dict__.update(family=traced, is_limit=base.is_limit, indices=torch.stack(behind))
+        ones = torch.ones(elements * count, dtype=torch.float64)
+        here.__dict__.update(
+            family=traced,
+            is_limit=base.is_limit,
+            indices=torch.stack(behind),
+            scales=torch.cat([base.scales, ones]),
+        )
         return here
 
 
@@ -159,6 +165,11 @@ class _FamilyOfGlasses:
             indices=self.indices,
             variables=self.variables,
             index_derivatives=self.index_derivatives,
+        )
+
+    def jacobians(self, values: Tensor, rays: FamilyRays, outputs: Sequence[str]) -> FamilyJacobian:
+        return self.family.jacobians(
+            values, rays, outputs, self.indices, self.variables, self.index_derivatives
         )
 
     def trace(self, values: Tensor, rays: FamilyRays) -> TracedRays:
