@@ -76,6 +76,18 @@ ABOVE = math.degrees(math.asin(math.sin(CRITICAL) * (1.0 + 1e-6)))
 
 ASPHERE = {"curvature": 0.08, "conic": -1.2, "a4": -1e-4, "a6": 2e-6, "a8": -1e-8, "a10": 5e-11}
 
+# The last surface of a telephone's lens: its higher terms undo its parabola, whose own intersection
+# with these rays lies 6 mm behind the vertex plane, beyond where the polynomial turns.
+UNDONE = {
+    "curvature": 0.5684633602886572,
+    "conic": -1.0,
+    "a4": -0.04273731388052537,
+    "a6": 0.00421241411897839,
+    "a8": -0.0002477096359840808,
+    "a10": 5.76124160062603e-06,
+}
+SLANTED = (-0.01, 0.339, 0.9407332246)
+
 # Of the first order of 1000 grooves per mm at 587.5618 nm, 1 ∓ 1e-6 along the plane behind it.
 SPREAD = 587.5618e-6 * 1000.0
 DIFFRACTED, EVANESCENT = (math.degrees(math.asin(s - SPREAD)) for s in (1.0 - 1e-6, 1.0 + 1e-6))
@@ -102,6 +114,15 @@ CASES: dict[str, HardCase] = {
     "grazing incidence on a sphere, 89.9°": HardCase(
         [surface(radius=1000.0, semi_diameter=100.0)],
         rays=[((-20.0, 0.0, 0.0), at_angle(89.9)), ((-1.0, 2.0, 0.5), at_angle(89.0, 30.0))],
+    ),
+    "asphere whose higher terms undo its conic": HardCase(
+        [surface("even_asphere", semi_diameter=3.65, **UNDONE)],
+        rays=[
+            ((0.022, 2.428, 0.0), towards((0.0, 0.0, 0.0), SLANTED)),
+            ((-0.05, 2.380, 0.0), towards((0.0, 0.0, 0.0), SLANTED)),
+            ((0.3, -2.2, 0.0), towards((0.0, 0.0, 0.0), (0.1, -0.33, 0.9))),
+        ],
+        sensor=2.0,
     ),
     "hemisphere near its edge": HardCase(
         [surface(radius=-10.0, semi_diameter=10.0)],

@@ -110,38 +110,53 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 )  # fmt: skip
                 w[DISTANCE + i] = clamp(t, limit) if squared > zero else zero
         moving = zero
-        for _ in range(NEWTON_STEPS):
+        for begin in range(2 if q[STARTS_ON_CONIC] != 0 else 1):
+            for _ in range(NEWTON_STEPS):
+                for i in range(BLOCK):
+                    t = w[DISTANCE + i]
+                    w[POINT_X + i] = dst[X + i] + src[L + i] * t
+                    w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
+                call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
+                moving = zero
+                for i in range(BLOCK):
+                    t, n = w[DISTANCE + i], src[N + i]
+                    slope = src[L + i] * w[SLOPE_X + i] + src[M + i] * w[SLOPE_Y + i] - n
+                    size = math.fabs(slope)
+                    change = (w[SAG + i] - n * t) / math.copysign(
+                        size if size > grazing else grazing, slope
+                    )
+                    change = clamp(change, scale)
+                    t = t - change
+                    w[DISTANCE + i] = t
+                    # A ray that has ended already keeps no other waiting.
+                    far = math.fabs(change) > close * (math.fabs(t) + scale)
+                    moving += one if far and not src[ENDED + i] > zero else zero
+                if moving == zero:
+                    break
             for i in range(BLOCK):
                 t = w[DISTANCE + i]
                 w[POINT_X + i] = dst[X + i] + src[L + i] * t
                 w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
             call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
-            moving = zero
+            if begin == 1 or q[STARTS_ON_CONIC] == 0:
+                break
+            # Rays that end at no root that counts begin once more, on the vertex plane.
+            again = zero
             for i in range(BLOCK):
                 t, n = w[DISTANCE + i], src[N + i]
                 slope = src[L + i] * w[SLOPE_X + i] + src[M + i] * w[SLOPE_Y + i] - n
-                size = math.fabs(slope)
-                change = (w[SAG + i] - n * t) / math.copysign(
-                    size if size > grazing else grazing, slope
+                off, reach = (
+                    math.fabs(w[SAG + i] - n * t),
+                    math.fabs(slope) * (math.fabs(t) + scale),
                 )
-                change = clamp(change, scale)
-                t = t - change
-                w[DISTANCE + i] = t
-                # A ray that has ended already keeps no other waiting.
-                far = math.fabs(change) > close * (math.fabs(t) + scale)
-                moving += one if far and not src[ENDED + i] > zero else zero
-            if moving == zero:
+                counts = sense * slope < zero and off <= close * reach
+                if not counts and t != zero and not src[ENDED + i] > zero:
+                    w[DISTANCE + i] = zero
+                    again += one
+            if again == zero:
                 break
         # Where the loop went on to its end, those that converge have done so long before.
-        more = LAST_STEPS if moving == zero else 0
-        for number in range(more + 1):
-            for i in range(BLOCK):
-                t = w[DISTANCE + i]
-                w[POINT_X + i] = dst[X + i] + src[L + i] * t
-                w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
-            call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
-            if number == more:
-                break
+        for _ in range(LAST_STEPS if moving == zero else 0):
             moving = zero
             for i in range(BLOCK):
                 t, n = w[DISTANCE + i], src[N + i]
@@ -155,6 +170,11 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                     moving += one
             if moving == zero:
                 break
+            for i in range(BLOCK):
+                t = w[DISTANCE + i]
+                w[POINT_X + i] = dst[X + i] + src[L + i] * t
+                w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
+            call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
         for i in range(BLOCK):
             l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             t, sag, sx, sy = w[DISTANCE + i], w[SAG + i], w[SLOPE_X + i], w[SLOPE_Y + i]

@@ -29,7 +29,8 @@ def explicit_intersect(
         t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
     moving = tl.full((), 1, tl.int32)
     steps = tl.full((), 0, tl.int32)
-    while (moving > 0) & (steps < MAX_STEPS):
+    most = tl.full((), MAX_STEPS, tl.int32)
+    while (moving > 0) & (steps < most):
         sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
         change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
         change = clamp(change, scale)
@@ -37,6 +38,17 @@ def explicit_intersect(
         moves = tl.abs(change) > close * (tl.abs(t) + scale)
         moving = tl.max(moves.to(tl.int32), 0)
         steps += 1
+        if FORM[ON_CONIC]:
+            if ((moving == 0) | (steps == most)) & (most == MAX_STEPS):
+                # Rays that end at no root that counts begin once more, on the vertex plane.
+                sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+                slope = l * sx + m * sy - n
+                reach = tl.abs(slope) * (tl.abs(t) + scale)
+                counts = (sense * slope < 0.0) & (tl.abs(sag - n * t) <= close * reach)
+                again = (t != 0.0) & ~counts
+                t = tl.where(again, 0.0, t)
+                moving = tl.max(again.to(tl.int32), 0)
+                most = steps + MAX_STEPS
     # Rays along a tangent are not there yet: they take some steps more.  Where the loop went on to
     # its end, those that converge have done so long before.
     sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)

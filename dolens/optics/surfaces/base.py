@@ -250,9 +250,17 @@ class Surface(nn.Module):
         def step(values: Parameters, rays: tuple[Tensor, ...], t: Tensor) -> Tensor:
             return _newton_step(cls, values, PlaneRay(*rays), t)
 
+        def accepts(values: Parameters, rays: tuple[Tensor, ...], t: Tensor) -> Tensor:
+            """Say whether a ray is near the sag and crosses it in the direction of `sense`."""
+            x, y, l, m, n = rays  # noqa: E741
+            sag, sx, sy, _ = cls.sag_and_gradient(values, x + l * t, y + m * t)
+            slope = l * sx + m * sy - n
+            reach = slope.abs() * (t.abs() + scale)
+            return (sense * slope < 0.0) & ((sag - n * t).abs() <= math.sqrt(epsilon) * reach)
+
         with torch.no_grad():
             start = cls.start(p, ray, sense).clamp(-FAR * scale, FAR * scale)
-        t = find_root(step, p, start, ray, scale)
+        t = find_root(step, accepts, p, start, ray, scale)
         # Lost rays take their derivatives, which nobody uses, at the vertex: they are finite there.
         lost = t != t
         t = t.masked_fill(lost, 0.0)

@@ -10,6 +10,8 @@ from torch import Tensor
 MAX_STEPS = 40
 
 Step = Callable[[Mapping[str, Tensor], tuple[Tensor, ...], Tensor], Tensor]
+# Of the same arguments: whether t is a root that counts.
+Accepts = Callable[[Mapping[str, Tensor], tuple[Tensor, ...], Tensor], Tensor]
 
 
 class _Root(torch.autograd.Function):
@@ -21,18 +23,17 @@ class _Root(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(step: Step, names: tuple[str, ...], scale: float, *tensors: Tensor) -> Tensor:
+    def forward(
+        step: Step, accepts: Accepts, names: tuple[str, ...], scale: float, *tensors: Tensor
+    ) -> Tensor:
         start, *ray = tensors[:6]
         values = dict(zip(names, tensors[6:], strict=True))
-        epsilon = torch.finfo(start.dtype).eps
-        t, change = start.clone(), torch.zeros_like(start)
-        for _ in range(MAX_STEPS):
-            change = step(values, tuple(ray), t).clamp(-scale, scale)
-            t = t - change
-            # Newton converges quadratically: after a step of √ε the next is below rounding.
-            if bool((change.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
-                return t
-        return t.masked_fill(~(change.abs() < scale), math.nan)
+        t = _iterated(step, values, tuple(ray), start, scale)
+        again = (start != 0.0) & ~accepts(values, tuple(ray), t)
+        if bool(again.any()):
+            second = torch.where(again, torch.zeros_like(t), t)
+            t = torch.where(again, _iterated(step, values, tuple(ray), second, scale), t)
+        return t
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -52,11 +53,12 @@ class _Root(torch.autograd.Function):
         info: Any,
         in_dims: tuple[Any, ...],
         step: Step,
+        accepts: Accepts,
         names: tuple[str, ...],
         scale: float,
         *tensors: Tensor,
     ) -> tuple[Tensor, int]:
-        dims = in_dims[3:]
+        dims = in_dims[4:]
         size = info.batch_size
         moved = [
             t.movedim(d, 0) if d is not None else t for t, d in zip(tensors, dims, strict=True)
@@ -67,6 +69,7 @@ class _Root(torch.autograd.Function):
             rows = [
                 _Root.apply(
                     step,
+                    accepts,
                     names,
                     scale,
                     *(t[i] if b else t for t, b in zip(moved, batched, strict=True)),
@@ -83,11 +86,27 @@ class _Root(torch.autograd.Function):
         # Where the parameters alone differ, the first guess is one for all: it becomes the batch.
         full = torch.broadcast_shapes((size, *(1,) * rank), *(t.shape for t in ready[:6]))
         ready[0] = ready[0].expand(full)
-        return _Root.apply(step, names, scale, *ready), 0
+        return _Root.apply(step, accepts, names, scale, *ready), 0
+
+
+def _iterated(
+    step: Step, values: Mapping[str, Tensor], ray: tuple[Tensor, ...], start: Tensor, scale: float
+) -> Tensor:
+    """Return where Newton's iteration ends; NaN where it still takes its longest steps."""
+    epsilon = torch.finfo(start.dtype).eps
+    t, change = start.clone(), torch.zeros_like(start)
+    for _ in range(MAX_STEPS):
+        change = step(values, ray, t).clamp(-scale, scale)
+        t = t - change
+        # Newton converges quadratically: after a step of √ε the next is below rounding.
+        if bool((change.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
+            return t
+    return t.masked_fill(~(change.abs() < scale), math.nan)
 
 
 def find_root(
     step: Step,
+    accepts: Accepts,
     parameters: Mapping[str, Tensor],
     start: Tensor,
     ray: tuple[Tensor, ...],
@@ -95,8 +114,12 @@ def find_root(
 ) -> Tensor:
     """Iterate t ← t - step(parameters, ray, t) until no ray moves; no gradient.
 
+    A ray that ends at no root that counts begins once more at t = 0: where terms undo most of a
+    deep conic, its own intersection lies beyond where the polynomial turns.
+
     Args:
         step: Newton's step F/F_t, elementwise in the rays.
+        accepts: whether t is a root that counts, elementwise.
         parameters: name → tensor, as `step` takes them.
         start: first guess, mm.
         ray: five tensors that broadcast with `start`.
@@ -108,4 +131,4 @@ def find_root(
     """
     names = tuple(parameters)
     tensors = (start, *ray, *parameters.values())
-    return _Root.apply(step, names, scale, *(tensor.detach() for tensor in tensors))
+    return _Root.apply(step, accepts, names, scale, *(tensor.detach() for tensor in tensors))
