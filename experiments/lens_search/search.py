@@ -63,6 +63,8 @@ class LensSearchModule(Analysis):
         "search/lens_iterations",
         "search/forms_that_hold",
         "search/glass_loss",
+        "search/secondary_spectrum_um",
+        "search/lateral_colour_um",
     )
 
     def __init__(
@@ -125,7 +127,16 @@ class LensSearchModule(Analysis):
         best = self._best.found
         fields = [(0.0, float(angle)) for angle in self.specification.fields]
         spots = spot_diagram(best.lens, fields, self.specification.wavelengths)
-        return {
+        colour = self._best.colour
+        of_colour = (
+            {}
+            if colour is None
+            else {
+                "search/secondary_spectrum_um": colour.secondary_um,
+                "search/lateral_colour_um": colour.lateral_um,
+            }
+        )
+        return of_colour | {
             "search/best_rms_spot_um": best.mean_rms_spot_um,
             "search/best_rms_spot_um_through_stop": 1e3 * float(spots.polychromatic_rms.mean()),
         }

@@ -101,7 +101,7 @@ def with_real_glasses(
         cost = optimise(start).merit[0] * merit.glasses.costs(choice.costs)
     found = snap_glasses(start, merit.glasses.coordinates, optimise, plan.snapping, cost)
     trials = found.several.trials
-    u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)[: 2 * plan.kept]
+    u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)
     held = merit.held()
     none = torch.zeros(len(u), dtype=torch.float64)
     grown = Grown(u, torch.arange(len(u)), none, none, 0, ())

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from dolens.lens_search.glass.designs import GlassTrials, Reoptimise, Reoptimised
+from dolens.lens_search.glass.designs import GlassModel, GlassTrials, Reoptimise, Reoptimised
 from dolens.lens_search.glass.glass_merit import GlassMerit
 from dolens.lens_search.glass.glass_models import glass_models
 from dolens.lens_search.glass.own_glasses import FREE
@@ -21,8 +21,10 @@ def reoptimiser(
 ) -> Reoptimise:
     """Return the callback of `snap_glasses` for lenses of a search.
 
-    Its merit is the root of the augmented Lagrangian: of the spots alone where operands hold, since
-    what their shifts add to the sum of squares is taken off.
+    What is made small is Σ ω·spot² with operands and walls, and the merit that is returned is the
+    mean of the spots over the focal length, as that of a search is.  The rest of the augmented
+    Lagrangian, without what shifts add where operands hold, counts as such an increase of the mean:
+    with ω ~ 1/spot, d(mean) is d(Σ ω·spot²)·mean(1/spot)/2.
 
     Args:
         merit: of lenses and glasses.
@@ -58,8 +60,16 @@ def reoptimiser(
             free[:, :last],
             merit.shape,
         )
-        square = (found.merit - shifted[trials.lens]).clamp(min=0.0)
-        return Reoptimised(square.sqrt(), at[:, :first], coordinates, model)
+        spots = merit.spots(at, asked) / merit.specification.focal_length
+        square = (asked.field_weights * spots.square()).sum(1)
+        rest = found.merit - shifted[trials.lens] - square
+        mean = spots.mean(1)
+        whole = mean + 0.5 * rest * (1.0 / spots.clamp(min=1e-12)).mean(1)
+        # The model is of the squared merit, in its own unit.
+        unit = (mean.square() / square.clamp(min=1e-30)).nan_to_num(1.0)[:, None, None]
+        model = GlassModel(unit * model.slopes, unit[..., None] * model.curvatures)
+        whole = torch.where(usable, whole.clamp(min=0.0), torch.inf)
+        return Reoptimised(whole, at[:, :first], coordinates, model)
 
     return run
 
