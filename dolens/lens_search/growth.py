@@ -64,6 +64,9 @@ STAGES = (
 
 # Lenses evaluated together: their arrays then stay in the processor's cache.
 _AT_A_TIME = 1024
+# Parts of the way to the next stage that are tried, and how often a lens goes a part of it.
+_STEPS = (1.0, 0.5, 0.25, 0.125)
+_TRIES = 4
 # Of a finish, the last rounds have operands whose weight grows by a factor.
 _FIRM_ROUNDS, _FIRMER = 2, 3.0
 
@@ -104,21 +107,74 @@ def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -
     """
     values, numbers = starts, torch.arange(len(starts))
     survivors, iterations = [len(starts)], 0
+    before = stages[0]
     for stage in stages:
-        sampled = merit.sampled(stage.rings, stage.arms)
-        conditions = sampled.full(len(values))
-        conditions = replace(
-            conditions,
-            f_number=conditions.f_number * stage.f_number,
-            field=conditions.field * stage.field,
-        )
-        found = _minimised(sampled, values, conditions, stage.iterations, stage.tolerance)
+        found = _at_stage(merit, values, before, stage)
+        before = stage
         iterations += int(found.iterations.sum())
         best = found.merit.argsort()[: max(1, round(stage.kept * len(values)))]
         best = best[torch.isfinite(found.merit[best])]
         values, numbers = found.values[best], numbers[best]
         survivors.append(len(values))
     return _described(merit, values, numbers, iterations, survivors)
+
+
+def _at_stage(merit: SearchMerit, starts: Tensor, before: Stage, stage: Stage) -> BatchResult:
+    """Return lenses optimised at a stage; those whose rays fail there go a part of the way first.
+
+    Args:
+        merit: of the lenses.
+        starts: u, (n, P), optimised at the stage before.
+        before: that stage.
+        stage: the next one.
+    """
+    sampled = merit.sampled(stage.rings, stage.arms)
+    values, count = starts.clone(), len(starts)
+    reached = torch.zeros(count, dtype=torch.float64)
+    merits = torch.full((count,), torch.inf, dtype=torch.float64)
+    iterations = torch.zeros(count, dtype=torch.int64)
+    ended = torch.zeros(count, dtype=torch.int8)
+    going = torch.arange(count)
+    for _ in range(_TRIES):
+        reached[going] = _reachable(sampled, values[going], before, stage, reached[going])
+        conditions = _between(sampled, before, stage, reached[going])
+        found = _minimised(sampled, values[going], conditions, stage.iterations, stage.tolerance)
+        values[going], ended[going] = found.values, found.ended
+        iterations[going] += found.iterations
+        there = reached[going] == 1.0
+        merits[going] = torch.where(there, found.merit, torch.inf)
+        going = going[~there & torch.isfinite(found.merit)]
+        if not len(going):
+            break
+    return BatchResult(values, merits, iterations, ended)
+
+
+def _reachable(
+    merit: SearchMerit, values: Tensor, before: Stage, stage: Stage, reached: Tensor
+) -> Tensor:
+    """Return the share of the way from a stage to the next at which all rays of a lens pass, (n,):
+    all of what is left, or a half, a quarter or an eighth of it; where not even that, `reached`.
+    """
+    found, left = reached.clone(), torch.arange(len(values))
+    for step in _STEPS:
+        share = reached[left] + step * (1.0 - reached[left])
+        spots = merit.spots(values[left], _between(merit, before, stage, share))
+        passes = torch.isfinite(spots).all(-1)
+        found[left[passes]] = share[passes]
+        left = left[~passes]
+        if before == stage or not len(left):
+            break
+    return found
+
+
+def _between(merit: SearchMerit, before: Stage, stage: Stage, share: Tensor) -> Conditions:
+    """Return the conditions of n lenses, each a share of the way from one stage to the next."""
+    full = merit.full(len(share))
+    return replace(
+        full,
+        f_number=full.f_number * (before.f_number + share * (stage.f_number - before.f_number)),
+        field=full.field * (before.field + share * (stage.field - before.field)),
+    )
 
 
 def finish(

@@ -1,6 +1,6 @@
 """Designs lead to others: an element is put in where it changes little, or taken out.
 
-A thin shell with both curvatures of the surface that it touches bends nearly no ray.  A minimum
+A thin shell with both faces like the surface that it touches bends nearly no ray.  A minimum
 with such a shell put in is close to a saddle of the problem with one element more, and from it the
 merit falls on two sides, to two minima (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009).
 """
@@ -37,9 +37,10 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class _Group:
-    """Curvatures and thicknesses of one cemented group, each (n,)."""
+    """Curvatures, aspheric coefficients and thicknesses of one cemented group, each (n,)."""
 
     curvatures: Sequence[Tensor]
+    coefficients: Sequence[Sequence[Tensor]]
     thicknesses: Sequence[Tensor]
 
     @property
@@ -66,7 +67,9 @@ class _Parts:
 
     @property
     def arrangement(self) -> Arrangement:
-        return Arrangement(tuple(len(group.thicknesses) for group in self.groups), self.stop)
+        groups = tuple(len(group.thicknesses) for group in self.groups)
+        terms = tuple(len(own) for group in self.groups for own in group.coefficients)
+        return Arrangement(groups, self.stop, terms=terms if any(terms) else ())
 
     def values(self) -> Tensor:
         """Return u, (n, P)."""
@@ -74,13 +77,16 @@ class _Parts:
         gaps = list(self.spaces[0])
         for group, space in zip(self.groups, self.spaces[1:], strict=True):
             gaps += [*group.thicknesses, *space]
-        return torch.stack([*curvatures, *gaps, self.image], -1)
+        bent = [a for group in self.groups for own in group.coefficients for a in own]
+        return torch.stack([*curvatures, *gaps, self.image, *bent], -1)
 
 
 def _parts(arrangement: Arrangement, values: Tensor) -> _Parts:
     """Return the numbers of lenses u (n, P) by groups."""
     columns = list(values.unbind(-1))
-    curvatures, rest = columns[: arrangement.surfaces], columns[arrangement.surfaces : -1]
+    image = arrangement.image_column
+    curvatures, rest = columns[: arrangement.surfaces], columns[arrangement.surfaces : image]
+    bent = [[columns[n] for n in own] for own in arrangement.coefficient_columns]
     last = len(arrangement.groups)
     groups, spaces = [], []
     for number in range(last + 1):
@@ -90,9 +96,9 @@ def _parts(arrangement: Arrangement, values: Tensor) -> _Parts:
         rest = rest[size:]
         if number < last:
             count = arrangement.groups[number]
-            groups.append(_Group(curvatures[: count + 1], rest[:count]))
-            curvatures, rest = curvatures[count + 1 :], rest[count:]
-    return _Parts(groups, spaces, columns[-1], arrangement.stop)
+            groups.append(_Group(curvatures[: count + 1], bent[: count + 1], rest[:count]))
+            curvatures, bent, rest = curvatures[count + 1 :], bent[count + 1 :], rest[count:]
+    return _Parts(groups, spaces, columns[image], arrangement.stop)
 
 
 def inserted(
@@ -112,11 +118,12 @@ def inserted(
     found = []
     surface = 0
     for number, group in enumerate(parts.groups):
-        ends = ((number, False, group.curvatures[0]), (number + 1, True, group.curvatures[-1]))
-        for space, behind, curvature in ends:
+        ends = ((number, False, 0), (number + 1, True, -1))
+        for space, behind, end in ends:
+            curvature, bent = group.curvatures[end], group.coefficients[end]
             at = surface + (len(group.curvatures) if behind else 1)
             for side in (_OFF_SADDLE, -_OFF_SADDLE):
-                shell = _Group([curvature, curvature + side], [thickness])
+                shell = _Group([curvature, curvature + side], [bent, bent], [thickness])
                 made = _with_group(parts, space, behind, shell, air)
                 words = f"shell {'behind' if behind else 'before'} surface {at}"
                 found.append(_neighbours(made, len(values), words))

@@ -17,7 +17,7 @@ from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
 
 # Shares of the beam's height at which aspheres, and the spaces beside them, are looked at.
-_ZONES = (0.4, 0.6, 0.8, 0.9, 1.0)
+_ZONES = (0.35, 0.55, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 
 def paraxial_operands(
@@ -63,11 +63,13 @@ def paraxial_operands(
         for n, _ in spaces
     ]
     least_over_f = torch.tensor(least, dtype=torch.float64)[:, None] / f
-    for zone in _ZONES if arrangement.aspheres else _ZONES[-1:]:
-        before, behind = _at_edge(arrangement, heights, [n for n, _ in spaces], zone)
-        sag = sags(arrangement, lenses, [n for n, _ in spaces], before)
-        next_sag = sags(arrangement, lenses, [n + 1 for n, _ in spaces], behind)
-        found.append(least_over_f - (thickness + next_sag - sag))
+    zones = len(_ZONES) if arrangement.aspheres else 1
+    surfaces = [n for n, _ in spaces]
+    before, behind = _to_the_edge(arrangement, heights, surfaces)
+    sag = sags(arrangement, lenses, zones * surfaces, before)
+    next_sag = sags(arrangement, lenses, zones * [n + 1 for n in surfaces], behind)
+    room = (thickness + -least_over_f).rows.repeat(zones, 1, 1)
+    found.append(sag - next_sag - Tangents(room))
     stop = arrangement.stop_place
     widest = limits.glass[1] if arrangement.within else limits.air[1]
     if widest is not None and 0 < stop < len(arrangement.sequence) - 1:
@@ -103,22 +105,48 @@ def _sum(gaps: Sequence[Tangents]) -> Tangents:
     return total
 
 
-def _at_edge(
-    arrangement: Arrangement, heights: Tangents, surfaces: Sequence[int], zone: float
+def _to_the_edge(
+    arrangement: Arrangement, heights: Tangents, surfaces: Sequence[int]
 ) -> tuple[Tangents, Tangents]:
-    """Return the heights on surfaces and on those behind them at a share of the way to the edge.
+    """Return the heights on surfaces and on those behind them at the zones, zone by zone; of a lens
+    without aspheres at the edge alone.
 
     Spheres go on to the higher of the two beams.  An asphere ends with its beam, and is flat from
-    there; glass reaches to the higher of its two beams, and air is looked at up to the lower one.
+    there to the edge of its element, which is as high as the highest beam on its surfaces; air is
+    looked at up to the lower of two edges.
     """
     own, other = heights[list(surfaces)], heights[[n + 1 for n in surfaces]]
     higher = own.maximum(other)
     if not arrangement.aspheres:
         return higher, higher
-    lower = -(-own).maximum(-other)
+    elements = _element_heights(arrangement, heights)
+    higher = elements[list(surfaces)]
+    lower = _least(higher, elements[[n + 1 for n in surfaces]])
     glass = torch.tensor([arrangement.media_behind[n] != AIR for n in surfaces])[:, None, None]
-    edge = zone * Tangents(torch.where(glass, higher.rows, lower.rows))
-    return -(-edge).maximum(-own), -(-edge).maximum(-other)
+    edge = torch.where(glass, higher.rows, lower.rows)
+    every = Tangents(torch.cat([zone * edge for zone in _ZONES]))
+    return _least(every, own), _least(every, other)
+
+
+def _element_heights(arrangement: Arrangement, heights: Tangents) -> Tangents:
+    """Return the height of the element, or cemented group, that each surface is of."""
+    found: list[Tensor] = []
+    group: list[int] = []
+    for number, behind in enumerate(arrangement.media_behind):
+        group.append(number)
+        if behind == AIR:
+            highest = heights[[group[0]]]
+            for other in group[1:]:
+                highest = highest.maximum(heights[[other]])
+            found += [highest.rows] * len(group)
+            group = []
+    return Tangents(torch.cat(found))
+
+
+def _least(every: Tangents, own: Tangents) -> Tangents:
+    """Return the lesser of heights at all zones and one of each surface."""
+    repeated = own.rows.repeat(len(every.rows) // len(own.rows), 1, 1)
+    return Tangents(torch.where((every.value <= repeated[:, 0])[:, None], every.rows, repeated))
 
 
 def _slopes(
@@ -128,5 +156,6 @@ def _slopes(
     surfaces = arrangement.aspheres
     at = heights[surfaces]
     most = math.tan(math.radians(limit))
-    found = [asphere_slopes(arrangement, lenses, surfaces, zone * at) for zone in _ZONES]
-    return Tangents(torch.cat([part.rows for part in found])).abs() / most - 1.0
+    every = Tangents(torch.cat([zone * at.rows for zone in _ZONES]))
+    slope = asphere_slopes(arrangement, lenses, len(_ZONES) * surfaces, every)
+    return slope.abs() / most - 1.0

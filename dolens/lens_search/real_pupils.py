@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.merit import Conditions, SearchMerit
-from dolens.lens_search.search_rays import through_points
+from dolens.lens_search.search_rays import launched, through_points
 from dolens.optics.lens_family import FamilyRays
 
 # Of the stop, in radii: the middle, and the rim above, below, at the side and between these.
@@ -28,8 +28,9 @@ _PROBES = torch.tensor(
 _STEPS = 6
 # Rays that miss their points of the stop by more than this share of its radius are not believed.
 _MISSED = 1e-3
-# Other rays of the beam reach a little farther than those at four points of the rim.
-_ROOM = 1.01
+# Of the half rim whose rays say how wide beams are; others reach a little farther.
+_AZIMUTHS = 9
+_ROOM = 1.001
 # Real beams beyond these factors of the paraxial ones are not believed either.
 _LEAST, _MOST = 0.5, 2.0
 
@@ -96,20 +97,24 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
         ],
         -1,
     )
+    believed = torch.where(found[:, None, None], pupils, conditions.pupils)
+    rim_rays = merit.rays.at_rim(_AZIMUTHS)
+    position, direction, _ = launched(rim_rays, radius, conditions.field, believed)
+    beams = FamilyRays(position, direction, rim_rays.wavelength)
     beam = []
     for number in range(merit.arrangement.surfaces):
         surface = merit.arrangement.sequence.index(number) + 2
-        height = at(points, surface)[0].norm(dim=-1).amax(-1) / f
+        there, _ = merit.family.intercepts(values, beams, surface)
         expected = abs(first_order.marginal[number]) * radius / f + abs(
             first_order.chief[number]
         ) * tangent.amax(-1)
-        beam.append(height / expected)
+        beam.append(there.norm(dim=-1).amax(-1) / f / expected)
     beam.append((stop_radius / (radius * (first_order.stop_height + zero))).abs())
     factors = _ROOM * torch.stack(beam, -1)
     found &= ((factors > _LEAST) & (factors < _MOST)).all(-1)
     return replace(
         conditions,
-        pupils=torch.where(found[:, None, None], pupils, conditions.pupils),
+        pupils=torch.where(found[:, None, None], believed, conditions.pupils),
         beam=torch.where(found[:, None], factors, conditions.beam),
     )
 

@@ -7,7 +7,6 @@ height h, an asphere c·h²/2 + a4·h⁴ + a6·h⁶ + ….
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.paraxial import LensNumbers
@@ -75,31 +74,31 @@ def _polynomials(
     respect to these, and Σ q·b·v·h^(q-1) times those of the height.
     """
     h = heights.value
-    value, of_height = torch.zeros_like(h), torch.zeros_like(h)
-    places: list[tuple[int, int]] = []
-    partials: list[Tensor] = []
-    for row, surface in enumerate(surfaces):
-        columns = [surface, *arrangement.coefficient_columns[surface]]
-        numbers = [lenses.curvatures[surface], *lenses.coefficients[surface]]
-        power = torch.ones_like(h[row])
-        square = h[row] * h[row]
-        # power = h^(q-1), of sags q = 2, 4, ...; of slopes q = 1, 3, ...
-        if not slopes:
-            power = h[row]
-        for order, (column, number) in enumerate(zip(columns, numbers, strict=True), 1):
-            q = 2 * order - (1 if slopes else 0)
-            factor = 0.5 if order == 1 else 1.0
-            if slopes:
-                factor *= 2.0 * order
-            term = factor * power
-            of_height[row] += q * term * number.value
-            term = term * h[row]
-            value[row] += term * number.value
-            places.append((row, 1 + column))
-            partials.append(term)
-            power = power * square
-    rows = heights.rows * of_height[:, None, :]
-    rows[:, 0] = value
-    at = tuple(torch.tensor(place) for place in zip(*places, strict=True))
-    rows[at] += torch.stack(partials)
+    known = sorted(set(surfaces))
+    terms = max(len(lenses.coefficients[n]) for n in known)
+    numbers = torch.zeros((len(known), 1 + terms, h.shape[-1]), dtype=h.dtype)
+    for row, n in enumerate(known):
+        for term, number in enumerate((lenses.curvatures[n], *lenses.coefficients[n])):
+            numbers[row, term] = number.value
+    numbers = numbers[[known.index(n) for n in surfaces]]
+    # Orders q = 2, 4, ... of sags, and 1, 3, ... of slopes.
+    order = torch.arange(2.0, 2.0 * terms + 3.0, 2.0, dtype=h.dtype)
+    factor = torch.ones_like(order)
+    factor[0] = 0.5
+    if slopes:
+        factor, order = factor * order, order - 1.0
+    first = torch.ones_like(h) if slopes else h
+    squares = (h * h)[:, None].expand(-1, terms, -1)
+    lower = torch.cat([first[:, None], squares], 1).cumprod(1)  # h^(q-1)
+    lower = lower * factor[:, None]
+    partial = lower * h[:, None]
+    rows = heights.rows * (lower * numbers * order[:, None]).sum(1)[:, None]
+    rows[:, 0] = (partial * numbers).sum(1)
+    places = [
+        (row, 1 + column, term)
+        for row, n in enumerate(surfaces)
+        for term, column in enumerate((n, *arrangement.coefficient_columns[n]))
+    ]
+    at, columns, which = (torch.tensor(place) for place in zip(*places, strict=True))
+    rows[at, columns] += partial[at, which]
     return Tangents(rows)

@@ -150,7 +150,7 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
         grown = grow(less, fewer.values, plan.stages[-2:-1])
         iterations += grown.iterations
         for more in inserted(fewer.arrangement, grown.values, specification):
-            if more.arrangement.groups != specification.groups:
+            if more.arrangement != Arrangement.of(specification, more.arrangement.stop):
                 continue
             if (more.arrangement.stop, 0) not in specification.places_of_stop:
                 continue

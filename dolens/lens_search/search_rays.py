@@ -44,18 +44,44 @@ class SearchRays:
         """Return the number of groups."""
         return self.fields + self.chiefs
 
+    def at_rim(self, azimuths: int) -> "SearchRays":
+        """Return rays of all fields and wavelengths through the half rim of the pupil.
 
-def half_pupil(rings: int, arms: int) -> tuple[Tensor, Tensor]:
+        Args:
+            azimuths: how many, from the lowest point to the highest.
+        """
+        azimuth = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, azimuths, dtype=torch.float64)
+        points = torch.stack([azimuth.cos(), azimuth.sin()], -1)
+        beams = torch.unique(torch.stack([self.field, self.wavelength]), dim=1)
+        field, wavelength = beams.repeat_interleave(azimuths, 1)
+        slopes = torch.stack([self.tangent[self.group == n][0] for n in range(self.fields)])
+        count = len(field)
+        return SearchRays(
+            points.repeat(beams.shape[1], 1),
+            slopes[field],
+            torch.ones(count, dtype=torch.float64),
+            field,
+            wavelength.to(torch.int32),
+            field,
+            self.fields,
+            0,
+        )
+
+
+def half_pupil(rings: int, arms: int, rim: bool = False) -> tuple[Tensor, Tensor]:
     """Return points of the half x ≥ 0 of the unit circle (N, 2) and weights that sum to one.
 
     Gaussian quadrature in r² (Forbes, J. Opt. Soc. Am. A 5, 1943, 1988): exact for even polynomials
-    of degree up to 4·rings - 2 in r, and of harmonics below 2·arms.
+    of degree up to 4·rings - 2 in r, and of harmonics below 2·arms.  With the rim it is Radau's
+    (Golub, SIAM Rev. 15, 318, 1973), exact up to 4·rings - 4: polynomial surfaces can turn steeply
+    beyond the outermost ray.
 
     Args:
         rings: radii.
         arms: azimuths of the half.
+        rim: whether the outermost ring is the rim itself.
     """
-    node, weight = np.polynomial.legendre.leggauss(rings)
+    node, weight = _radau(rings) if rim else np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt(0.5 * (node + 1.0))
     azimuth = -0.5 * math.pi + (np.arange(arms) + 0.5) * math.pi / arms
     points = radius[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
@@ -63,15 +89,25 @@ def half_pupil(rings: int, arms: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(points.reshape(-1, 2)), torch.from_numpy(shares)
 
 
+def _radau(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes from -1 to 1, the last of them 1, and weights that sum to two."""
+    order = np.arange(1, count)
+    beside = order / np.sqrt(4.0 * order**2 - 1.0)
+    matrix = np.diag(beside, 1) + np.diag(beside, -1)
+    matrix[-1, -1] = count / (2.0 * count - 1.0)
+    node, vectors = np.linalg.eigh(matrix)
+    return node, 2.0 * vectors[0] ** 2
+
+
 def search_rays(specification: Specification, rings: int = 4, arms: int = 8) -> SearchRays:
-    """Sample all fields and wavelengths, each wavelength alike.
+    """Sample all fields and wavelengths, each wavelength alike; of aspheres up to the rim.
 
     Args:
         specification: its fields and wavelengths.
         rings: of the pupil.
         arms: of its half.
     """
-    points, shares = half_pupil(rings, arms)
+    points, shares = half_pupil(rings, arms, rim=any(specification.asphere_terms))
     waves, fields = len(specification.wavelengths), len(specification.fields)
     pupil, tangent, weight, group, wavelength = [], [], [], [], []
     tangents = [math.tan(math.radians(angle)) for angle in specification.fields]

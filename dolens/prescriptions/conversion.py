@@ -23,9 +23,9 @@ from dolens.prescriptions.compare import Difference, differences
 from dolens.prescriptions.files import decode_prescription, encode_prescription
 from dolens.prescriptions.media import canonical_digits
 from dolens.prescriptions.simplifications import (
-    COMPARED_WAVELENGTHS,
     SIMPLIFICATIONS,
     Prescription,
+    compared_wavelengths,
     of_other_program,
     surfaces_text,
 )
@@ -173,7 +173,7 @@ def _parameters(lens: Lens) -> dict[str, torch.Tensor]:
 
 def _indices(lens: Lens) -> list[list[float]]:
     media = lens.system().materials
-    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in media]
+    return [[float(m.index(wave)) for wave in compared_wavelengths(m)] for m in media]
 
 
 @torch.no_grad()

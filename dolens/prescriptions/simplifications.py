@@ -1,11 +1,12 @@
 """A prescription is simplified for a format that cannot hold it, and what changes is said."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.materials import NO_GLASS, abbe_number, index_d, parse_material
+from dolens.optics.materials import NO_GLASS, Medium, abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.codev.glass import glass_word
 from dolens.prescriptions.media import canonical
@@ -34,7 +35,7 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
     if _suffix(new) not in (".txt", ".seq"):
         return []
     model = find_index_model(str(prescription.get("index_model", "dfc")))
-    said: dict[str, tuple[str, float, list[str]]] = {}
+    said: dict[str, tuple[str, float, Sequence[float], list[str]]] = {}
     for n, row in prescription["surfaces"].items():
         name = str(row.get("material")).strip()
         if row.get("material") is None or not _needs_numbers(name, new):
@@ -45,16 +46,26 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
             near = parse_material(pair, model)
         except InputError:
             continue
-        error = max(
-            abs(float(medium.index(w)) - float(near.index(w))) for w in COMPARED_WAVELENGTHS
-        )
-        said.setdefault(name, (pair, error, []))[2].append(str(n))
+        waves = compared_wavelengths(medium)
+        error = max(abs(float(medium.index(w)) - float(near.index(w))) for w in waves)
+        said.setdefault(name, (pair, error, waves, []))[3].append(str(n))
         row["material"] = pair
     return [
         f"the glass {name} behind {surfaces_text(numbers)} became {pair} (nd/Vd): its index "
-        f"differs by up to {error:.1g} from 400 to 700 nm"
-        for name, (pair, error, numbers) in said.items()
+        f"differs by up to {error:.1g} from {waves[0]:g} to {waves[-1]:g} nm"
+        for name, (pair, error, waves, numbers) in said.items()
     ]
+
+
+def compared_wavelengths(medium: Medium) -> Sequence[float]:
+    """Return where the indices of a medium are compared, nm: as far as its data go.
+
+    Args:
+        medium: glass of a catalogue has a range; other media are known everywhere.
+    """
+    shortest, longest = getattr(medium, "wavelengths", (0.0, math.inf))
+    inside = [wave for wave in COMPARED_WAVELENGTHS if shortest <= wave <= longest]
+    return inside or (shortest, longest)
 
 
 def _needs_numbers(name: str, new: str) -> bool:

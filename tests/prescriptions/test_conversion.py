@@ -148,3 +148,26 @@ def test_the_command_writes_whole_files_and_overwrites_none_unasked(tmp_path):
     assert new.read_bytes() == written
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zmx", "b.yaml"]
     assert run(old, new, "--force").exit_code == 0
+
+
+def test_a_plastic_whose_data_begin_at_437_nm_is_written_in_every_format():
+    """Indices are compared as far as a medium's data go."""
+    lens = {
+        "name": "plastic",
+        "stop": 1,
+        "wavelengths": [587.5618],
+        "surfaces": {
+            "1": {
+                "type": "sphere",
+                "radius": 20.0,
+                "semi_diameter": 5.0,
+                "thickness": 3.0,
+                "material": "PLASTIC:ZEONEX-E48R",
+            },
+            "2": {"type": "plane", "semi_diameter": 5.0, "material": "air"},
+        },
+        "sensor": {"distance": 36.0, "diameter": 10.0},
+    }
+    assert converted(lens, "plastic", "plastic.yaml").same_numbers
+    (said, *_) = converted(lens, "plastic", "plastic.seq").changes
+    assert "from 450 to 700 nm" in said
