@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import AIR, STOP, Arrangement, asphere
+from dolens.lens_search.lens_merit import with_glasses_of
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.real_pupils import stop_radii, with_real_beams
 from dolens.lens_search.specification import Specification
@@ -30,6 +31,8 @@ def designed_lens(
         values: u, (P,).
         name: of the lens.
     """
+    specification = with_glasses_of(arrangement, specification, values)
+    values = values[: arrangement.variables]
     f = specification.focal_length
     merit = SearchMerit.of(arrangement, specification, 1, 1)
     numbers, found = merit.first_order(values[None])

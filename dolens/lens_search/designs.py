@@ -66,17 +66,40 @@ class Designs:
         """Return those whose operands hold within a tolerance, and whose rays all pass."""
         return self.chosen((self.violation <= tolerance) & torch.isfinite(self.merit))
 
-    def of_distinct_forms(self, merit: SearchMerit, tolerance: float = TOLERANCE) -> "Designs":
-        """Return the best of each form, the best first.
+    def form_numbers(
+        self, merit: SearchMerit, by_glass: bool = False, tolerance: float = TOLERANCE
+    ) -> Tensor:
+        """Return the number of each design's form, (n,), int64, from 0.
 
         Args:
             merit: of this arrangement.
+            by_glass: whether lenses whose glasses have other names are of other forms.
             tolerance: see `dolens.lens_search.forms`.
         """
+        coordinates, ranked = form_coordinates(self.arrays(merit)), self.ranked_merit(merit)
+        if not by_glass:
+            return form_numbers(coordinates, ranked, tolerance)
+        numbers, first = torch.zeros(len(ranked), dtype=torch.int64), 0
+        kinds = merit.kinds(self.values)
+        for kind in kinds.unique().tolist():
+            mine = (kinds == kind).nonzero()[:, 0]
+            own = form_numbers(coordinates.taken(mine), ranked[mine], tolerance)
+            numbers[mine] = first + own
+            first += int(own.max()) + 1
+        return numbers
+
+    def ranked_merit(self, merit: SearchMerit) -> Tensor:
+        """Return the merit with what glasses cost, mm, (n,): the order of designs."""
+        return self.merit * merit.cost_factor(self.values)
+
+    def of_distinct_forms(
+        self, merit: SearchMerit, by_glass: bool = False, tolerance: float = TOLERANCE
+    ) -> "Designs":
+        """Return the best of each form, the best first; see `form_numbers`."""
         if not len(self.values):
             return self
-        numbers = form_numbers(form_coordinates(self.arrays(merit)), self.merit, tolerance)
-        order = self.merit.argsort(stable=True)
+        numbers = self.form_numbers(merit, by_glass, tolerance)
+        order = self.ranked_merit(merit).argsort(stable=True)
         seen: set[int] = set()
         first = [
             row
@@ -89,12 +112,13 @@ class Designs:
         """Return them as plain numbers of their sequences, for a comparison of forms."""
         a = self.arrangement
         numbers, found = merit.first_order(self.values)
+        of_media = merit.dispersions(self.values)
         radius = 0.5 / merit.specification.f_number
         field = float(merit.rays.tangent.max())
         zero = torch.zeros_like(numbers.image)
-        curvatures, heights, bent, indices = [], [], [], [zero + 1.0]
+        curvatures, heights, bent, indices, spread = [], [], [], [zero + 1.0], [zero]
         none = torch.stack([zero] * len(ZONES), -1)
-        behind = zero + 1.0
+        behind, falls = zero + 1.0, zero
         for place in a.sequence:
             if place == STOP:
                 curvatures.append(zero)
@@ -106,13 +130,16 @@ class Designs:
                 heights.append(zero + height)
                 bent.append(self._departures(numbers, place, zero + height))
                 behind = zero + numbers.indices[place + 1]
+                falls = zero if of_media is None else of_media[:, place + 1]
             indices.append(behind)
+            spread.append(falls)
         return FormArrays(
             torch.stack(curvatures, -1),
             torch.stack([*numbers.gaps, numbers.image], -1),
             torch.stack(indices, -1),
             torch.stack(heights, -1),
             1.0 / found.power,
+            None if of_media is None else torch.stack(spread, -1),
             departures=torch.stack(bent, 1) if a.aspheres else None,
             stop=a.stop_place + 1,
         )
@@ -132,7 +159,7 @@ class Designs:
 def element_powers(arrangement: Arrangement, values: Tensor, merit: SearchMerit) -> Tensor:
     """Return the thin powers of the elements, times the focal length, (n, elements)."""
     s = arrangement.surfaces
-    curvatures, indices = values[:, :s], merit.indices[:, 0]
+    curvatures, indices = values[:, :s], merit.first_order(values)[0].indices
     powers = []
     for surface, medium in enumerate(arrangement.media_behind):
         if medium >= 0:

@@ -8,6 +8,7 @@ from dolens.errors import InputError
 from dolens.lens_search.files import SUFFIXES, WrittenFile, form_name, write_form
 from dolens.lens_search.form_words import glasses_text, powers_text
 from dolens.lens_search.found import FoundLens
+from dolens.lens_search.lens_colour import LensColour, lens_colour
 from dolens.lens_search.real_beams import with_drawn_heights
 from dolens.lens_search.requirements import Requirements
 from dolens.lens_search.sensitivity import LensSensitivity, lens_sensitivity
@@ -33,6 +34,7 @@ class FormReport:
         files: one a format.
         starts: how many starts led to it; None where nobody counted.
         designs: how many designs are of this form; None where nobody counted.
+        colour: its colour errors; None for a single wavelength, or where they could not be found.
         problems: what could not be computed, and why, a sentence each.
     """
 
@@ -48,6 +50,7 @@ class FormReport:
     starts: int | None = None
     designs: int | None = None
     problems: tuple[str, ...] = ()
+    colour: LensColour | None = None
 
     @property
     def name(self) -> str:
@@ -93,7 +96,7 @@ def report_form(
         InputError: a file cannot be written.
     """
     lens, problems = found.lens, []
-    verification = sensitivity = section = None
+    verification = sensitivity = section = colour = None
     try:
         verification = verify(lens, required)
         lens = with_drawn_heights(lens, verification.beams.heights)
@@ -107,6 +110,10 @@ def report_form(
         section = form_section(lens)
     except InputError as error:
         problems.append(f"section: {error}")
+    try:
+        colour = lens_colour(lens)
+    except InputError as error:
+        problems.append(f"colour: {error}")
     return FormReport(
         number,
         found,
@@ -120,4 +127,5 @@ def report_form(
         starts,
         designs,
         tuple(problems),
+        colour,
     )

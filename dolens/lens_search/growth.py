@@ -189,7 +189,33 @@ def finish(
         iterations: of each round and lens, at most.
         tolerance: as of a stage; the last round's is a hundredth of it.
     """
-    values, used = grown.values, grown.iterations
+    done = settled(merit, grown.values, rounds, iterations, tolerance)
+    used = grown.iterations + done.iterations
+    return _described(done.merit, done.values, grown.starts, used, grown.survivors, done.conditions)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Lenses whose operands hold.
+
+    Attributes:
+        merit: with the operands' final weight.
+        values: u, (n, P).
+        conditions: with the final shifts, weights of fields and real beams.
+        iterations: of all lenses together.
+    """
+
+    merit: SearchMerit
+    values: Tensor
+    conditions: Conditions
+    iterations: int
+
+
+def settled(
+    merit: SearchMerit, values: Tensor, rounds: int, iterations: int, tolerance: float = 1e-4
+) -> Settled:
+    """Optimise lenses u (n, P) to the end, as `finish` does, and return the conditions, too."""
+    used = 0
     conditions = with_real_beams(merit, values, merit.full(len(values)))
     for number in range(rounds):
         last = number == rounds - 1
@@ -201,7 +227,7 @@ def finish(
         used += int(found.iterations.sum())
         values = found.values
         conditions = _next_conditions(merit, values, conditions)
-    return _described(merit, values, grown.starts, used, grown.survivors, conditions)
+    return Settled(merit, values, conditions, used)
 
 
 def _next_conditions(merit: SearchMerit, values: Tensor, conditions: Conditions) -> Conditions:
@@ -223,7 +249,7 @@ def _next_conditions(merit: SearchMerit, values: Tensor, conditions: Conditions)
 def _minimised(
     merit: SearchMerit, values: Tensor, conditions: Conditions, iterations: int, tolerance: float
 ) -> BatchResult:
-    lower, upper = merit.bounds()
+    lower, upper = merit.box(values)
 
     def evaluate(which: Tensor, u: Tensor) -> BatchModel:
         parts = zip(which.split(_AT_A_TIME), u.split(_AT_A_TIME), strict=True)

@@ -173,6 +173,42 @@ class SearchMerit:
             torch.tensor(upper, dtype=torch.float64),
         )
 
+    def box(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the boxes of lenses u, (P,) or (L, P) each: the same for all here."""
+        return self.bounds()
+
+    # ---------------------------------------------------------------- glasses
+
+    def completed(self, lenses: Tensor, generator: torch.Generator) -> Tensor:
+        """Return lenses (L, P) with the glasses that starts have: here those of the specification,
+        which are no variables.
+        """
+        return lenses
+
+    def are_real(self, u: Tensor) -> Tensor:
+        """Return which lenses have glasses that exist, (L,)."""
+        return torch.ones(len(u), dtype=torch.bool)
+
+    def cost_factor(self, u: Tensor) -> Tensor:
+        """Return what the merit of lenses is multiplied by for what their glasses cost, (L,)."""
+        return torch.ones(len(u), dtype=torch.float64)
+
+    def kinds(self, u: Tensor) -> Tensor:
+        """Return a number of the glasses of each lens, (L,): the same for the same glasses."""
+        return torch.zeros(len(u), dtype=torch.int64)
+
+    def colour(self, u: Tensor) -> Tensor:
+        """Return how far apart the foci of the outer wavelengths are, over f, (L,), where starts
+        are chosen by it: given glasses are for the descent to balance.
+        """
+        return torch.zeros(len(u), dtype=torch.float64)
+
+    def dispersions(self, u: Tensor) -> Tensor | None:
+        """Return how much the indices behind surfaces fall from the shortest wavelength to the
+        longest, (L, S + 1); None where all lenses have the same glasses.
+        """
+        return None
+
     # ---------------------------------------------------------------- values
 
     def lens_values(self, u: Tensor, pupil: Tensor) -> Tensor:

@@ -4,8 +4,8 @@ Each step is a list of tasks whose results depend on the task alone, so that tas
 process and a search can be taken up again where it was stopped.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 
@@ -15,9 +15,13 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs, element_powers
+from dolens.lens_search.glass.glass_merit import GlassMerit
+from dolens.lens_search.glass.glass_step import GlassPlan, with_real_glasses
 from dolens.lens_search.growth import STAGES, Grown, Stage, finish, grow
+from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.neighbours import inserted, taken_out
+from dolens.lens_search.parents import best_forms, parents_of, shares
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import DRAWN, random_starts
 from dolens.tasks import TaskMap
@@ -41,6 +45,7 @@ class SearchPlan:
         rings: of the rays that decide.
         arms: of these.
         seed: of the starts.
+        glass: of searches that choose glasses.
 
     Raises:
         InputError: a number out of range.
@@ -59,6 +64,7 @@ class SearchPlan:
     rings: int = 4
     arms: int = 8
     seed: int = 0
+    glass: GlassPlan = field(default_factory=GlassPlan)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stages", tuple(self.stages))
@@ -89,12 +95,15 @@ class Step:
         features: powers of the elements of the starts, (starts, elements); none of an escape.
         first: number of the first start.
         iterations: of all lenses together.
+        continuous: mean RMS spot of the form that these are of with continuous glasses, mm; None
+            where these were not snapped.
     """
 
     designs: tuple[Designs, ...]
     features: Tensor
     first: int
     iterations: int
+    continuous: float | None = None
 
 
 # The place of the stop, the number of the first start, and how many.
@@ -119,7 +128,7 @@ def grown_starts(specification: Specification, plan: SearchPlan, task: StartTask
     """Grow one batch of starts, and finish the better ones."""
     stop, first, count = task
     arrangement = Arrangement.of(specification, *stop)
-    merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
+    merit = merit_of(arrangement, specification, plan.rings, plan.arms, plan.glass.in_growth)
     generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
     starts = random_starts(merit, count, generator, plan.drawn)
     grown = grow(merit, starts, plan.stages)
@@ -174,6 +183,17 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
     return Step(tuple(found), none, 0, iterations)
 
 
+def real_glasses(specification: Specification, plan: SearchPlan, form: Designs) -> Step:
+    """Give one form catalogue glasses, and finish what comes of it."""
+    merit = merit_of(form.arrangement, specification, plan.rings, plan.arms)
+    assert isinstance(merit, GlassMerit)  # glasses are chosen
+    found = with_real_glasses(
+        merit, plan.glass, form, plan.finish_rounds, plan.finish_iterations, plan.tolerance
+    )
+    none = torch.zeros((0, specification.elements), dtype=torch.float64)
+    return Step((found.designs,), none, 0, found.iterations, found.continuous)
+
+
 def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -> Iterator[Step]:
     """Search, and yield what each task found as soon as it is known.
 
@@ -187,15 +207,20 @@ def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -
     for step in map_tasks(grown, start_tasks(specification, plan), "batches of starts"):
         pool = with_step(pool, step, specification, plan)
         yield step
+    if specification.glass_choice is not None:
+        best = best_forms(pool, plan.glass.forms)
+        snapped = partial(real_glasses, specification, plan)
+        yield from map_tasks(snapped, best, "forms whose glasses become real")
+        return
     if len(set(specification.element_glasses)) > 1 or specification.elements < 2:
         # An element that is taken out takes its glass with it.
         return
     tried: dict[Arrangement, Tensor] = {}
     for number in range(plan.escapes):
-        parents = _parents(pool, plan, tried)
+        parents = parents_of(pool, plan.parents, tried)
         if not parents:
             return
-        tasks = [part for group in parents for part in _shares(group)]
+        tasks = [part for group in parents for part in shares(group)]
         name = f"escapes of round {number + 1}"
         for step in map_tasks(partial(escapes, specification, plan), tasks, name):
             pool = with_step(pool, step, specification, plan)
@@ -213,50 +238,11 @@ def with_step(
     for designs in step.designs:
         if not len(designs.values):
             continue
-        merit = SearchMerit.of(designs.arrangement, specification, plan.rings, plan.arms)
+        merit = merit_of(designs.arrangement, specification, plan.rings, plan.arms)
         old = pool.get(designs.arrangement)
         joined = designs if old is None else Designs.joined([old, designs])
-        pool[designs.arrangement] = joined.of_distinct_forms(merit)
+        pool[designs.arrangement] = joined.of_distinct_forms(merit, plan.glass.apart)
     return pool
-
-
-def _parents(
-    pool: dict[Arrangement, Designs],
-    plan: SearchPlan,
-    tried: dict[Arrangement, Tensor],
-) -> list[Designs]:
-    """Return the best forms of all arrangements that have not been parents yet, and note them."""
-    ranked = sorted(
-        (float(merit), arrangement.stop, arrangement.within, row, arrangement)
-        for arrangement, designs in pool.items()
-        if not arrangement.within  # elements around a stop in glass cannot be taken apart
-        for row, merit in enumerate(designs.merit)
-    )
-    rows: dict[Arrangement, list[int]] = {}
-    count = 0
-    for _, _, _, row, arrangement in ranked:
-        values = pool[arrangement].values[row]
-        before = tried.get(arrangement)
-        if before is not None and bool((before - values).abs().amax(-1).lt(1e-3).any()):
-            continue
-        rows.setdefault(arrangement, []).append(row)
-        count += 1
-        if count == plan.parents:
-            break
-    found = []
-    for arrangement, chosen in rows.items():
-        designs = pool[arrangement].chosen(torch.tensor(chosen))
-        before = tried.get(arrangement)
-        tried[arrangement] = (
-            designs.values if before is None else torch.cat([before, designs.values])
-        )
-        found.append(designs)
-    return found
-
-
-def _shares(designs: Designs, size: int = 4) -> Sequence[Designs]:
-    rows = torch.arange(len(designs.values))
-    return [designs.chosen(part) for part in rows.split(size)]
 
 
 def _best(grown: Grown, share: float) -> Grown:

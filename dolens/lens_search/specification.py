@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dolens.errors import InputError
+from dolens.lens_search.glass.choice import GlassChoice
 
 # No limit.
 Limit = float | None
@@ -75,7 +76,10 @@ class Specification:
             which two pairs are cemented.
         stops: behind how many groups the stop may stand, in air; 0 is in front of the lens.
         stop_in_glass: whether it may stand within any element too, as a ring let into it.
-        glasses: of each element, as a prescription names them; a single one is that of all.
+        glasses: of each element, as a prescription names them; a single one is that of all.  Where
+            glasses are chosen, starts begin with these; none: starts draw theirs.
+        glass_choice: the glasses that a search may choose; None, or one without catalogues: those
+            given stand.
         asphere_terms: coefficients of r⁴, r⁶, ... of both surfaces of each element; a single number
             is that of all, 0 for spheres.  A cemented surface has those of the element in front of
             it.  An asphere's conic constant is -1: its sag is a polynomial, wherever the beam goes.
@@ -93,6 +97,7 @@ class Specification:
     stop_in_glass: bool = False
     asphere_terms: tuple[int, ...] = (0,)
     limits: Limits = field(default_factory=Limits)
+    glass_choice: GlassChoice | None = None
 
     def __post_init__(self) -> None:
         # Lists, as files give them, become tuples.
@@ -114,7 +119,10 @@ class Specification:
             )
         if not self.groups or min(self.groups) < 1:
             raise InputError(f"groups: each has one element or more, not {list(self.groups)}")
-        if len(self.glasses) not in (1, self.elements):
+        if self.glass_choice is not None and not self.glass_choice.catalogues:
+            object.__setattr__(self, "glass_choice", None)
+        drawn = self.glass_choice is not None and not self.glasses
+        if len(self.glasses) not in (1, self.elements) and not drawn:
             raise InputError(
                 f"glasses: one for all or {self.elements}, one for each element, "
                 f"not {len(self.glasses)}"
@@ -139,7 +147,9 @@ class Specification:
 
     @property
     def element_glasses(self) -> tuple[str, ...]:
-        """Return the glass of each element."""
+        """Return the glass of each element; nothing where starts draw theirs."""
+        if not self.glasses:
+            return ()
         return self.glasses * (self.elements // len(self.glasses))
 
     @property

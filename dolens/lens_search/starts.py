@@ -17,6 +17,8 @@ from dolens.lens_search.merit import SearchMerit
 DRAWN = 24
 # Newton's steps for the factor of the curvatures.
 _STEPS = 12
+# Of axial colour in the strain: that of a singlet of crown is worth 0.25.
+_COLOUR = 30.0
 
 
 def random_starts(
@@ -30,7 +32,8 @@ def random_starts(
         generator: of the random numbers.
         drawn: lenses that are drawn for one that is kept.
     """
-    scaled = _with_focal_length(merit, _drawn(merit, drawn * count, generator))
+    lenses = merit.completed(_drawn(merit, drawn * count, generator), generator)
+    scaled = _with_focal_length(merit, lenses)
     rank = _rank(merit, scaled)
     best = rank.argsort()[:count]
     return scaled[best[torch.isfinite(rank[best])]]
@@ -105,7 +108,7 @@ def _rank(merit: SearchMerit, lenses: Tensor) -> Tensor:
     numbers, found = merit.first_order(lenses)
     aperture = 0.5 / specification.f_number
     field = math.tan(math.radians(specification.fields[-1]))
-    strain = 4.0 * found.petzval.square()
+    strain = 4.0 * found.petzval.square() + (_COLOUR * merit.colour(lenses)).square()
     good = torch.isfinite(lenses).all(-1)
     for curvature, marginal, chief in zip(
         numbers.curvatures, found.marginal, found.chief, strict=True

@@ -1,6 +1,6 @@
 """What a search has found so far: all designs, their forms, and the best of them as lenses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -8,9 +8,10 @@ from torch import Tensor
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.designs import Designs
-from dolens.lens_search.form_coordinates import form_coordinates
-from dolens.lens_search.forms import distinct, form_numbers
+from dolens.lens_search.form_words import glasses_text
+from dolens.lens_search.forms import distinct
 from dolens.lens_search.found import FoundLens
+from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.search import SearchPlan, Step, with_step
 from dolens.lens_search.specification import Specification
@@ -56,6 +57,7 @@ class Finds:
         self._pool: dict[Arrangement, Designs] = {}
         self._course: Course | None = None
         self._all: list[tuple[Designs, float]] = []
+        self._snapped: list[tuple[float, float]] = []
 
     def add(self, step: Step, seconds: float) -> None:
         """Add a step that was known at a time."""
@@ -63,8 +65,30 @@ class Finds:
         self._course = None
         if len(step.features):
             self.features[step.first] = step.features
+        step = replace(step, designs=tuple(self._of_real_glasses(d) for d in step.designs))
         self._all += [(designs, seconds) for designs in step.designs if len(designs.values)]
         self._pool = with_step(self._pool, step, self.specification, self.plan)
+        merits = [float(m) for designs in step.designs for m in designs.merit]
+        if step.continuous is not None and merits:
+            self._snapped.append((min(merits), step.continuous))
+
+    def _of_real_glasses(self, designs: Designs) -> Designs:
+        """Return the designs whose glasses exist: those still continuous are on their way."""
+        merit = self._merit(designs.arrangement)
+        return designs.chosen(merit.are_real(designs.values))
+
+    def _merit(self, arrangement: Arrangement) -> SearchMerit:
+        return merit_of(arrangement, self.specification, 1, 1)
+
+    @property
+    def glass_loss(self) -> float | None:
+        """Return by what share the best form that was snapped has a greater mean RMS spot than
+        with continuous glasses; None where none was.
+        """
+        if not self._snapped:
+            return None
+        real, continuous = min(self._snapped)
+        return real / continuous - 1.0
 
     @property
     def designs(self) -> int:
@@ -103,7 +127,7 @@ class Finds:
         ranked = sorted(
             (float(merit), arrangement.stop, arrangement.within, row, arrangement)
             for arrangement, designs in self._pool.items()
-            for row, merit in enumerate(designs.merit)
+            for row, merit in enumerate(designs.ranked_merit(self._merit(arrangement)))
         )
         lenses = []
         for merit, _, _, row, arrangement in ranked[: 2 * count]:
@@ -114,7 +138,17 @@ class Finds:
             spots = tuple(_UM * float(spot) for spot in designs.spots[row])
             start = int(designs.starts[row])
             lenses.append(FoundLens(lens, _UM * merit, spots, start, designs.history[row]))
-        self.found = [form.best for form in distinct(lenses)][:count]
+        self.found = self._distinct(lenses)[:count]
+
+    def _distinct(self, lenses: list[FoundLens]) -> list[FoundLens]:
+        """Return the best lens of each form, the best first."""
+        if not self.plan.glass.apart:
+            return [form.best for form in distinct(lenses)]
+        of_glasses: dict[str, list[FoundLens]] = {}
+        for found in lenses:
+            of_glasses.setdefault(glasses_text(found.lens), []).append(found)
+        forms = [form.best for alike in of_glasses.values() for form in distinct(alike)]
+        return sorted(forms, key=lambda found: found.merit)
 
     def course(self) -> Course:
         """Return when each design was found, and its form; it is worked out once for a step."""
@@ -128,8 +162,7 @@ class Finds:
         for arrangement in self._pool:
             mine = [(d, s) for d, s in self._all if d.arrangement == arrangement]
             designs = Designs.joined([d for d, _ in mine])
-            merit = SearchMerit.of(arrangement, self.specification, 1, 1)
-            own = form_numbers(form_coordinates(designs.arrays(merit)), designs.merit)
+            own = designs.form_numbers(self._merit(arrangement), self.plan.glass.apart)
             numbers.append(own + first)
             first += int(own.max()) + 1
             merits.append(_UM * designs.merit)

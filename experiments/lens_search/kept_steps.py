@@ -13,6 +13,7 @@ import torch
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs
+from dolens.lens_search.glass.glass_set import chosen_glasses
 from dolens.lens_search.search import SearchPlan, Step
 from dolens.lens_search.specification import Specification
 from dolens.tasks import TaskMap
@@ -38,7 +39,10 @@ class KeptSteps:
         self.folder = folder
         self.seconds_before = 0.0
         self._number = 0
-        text = json.dumps([asdict(specification), asdict(plan)], sort_keys=True)
+        choice = specification.glass_choice
+        # Glasses are kept by their numbers: a catalogue that has changed has others.
+        names = choice and chosen_glasses(choice, tuple(specification.wavelengths)).names
+        text = json.dumps([asdict(specification), asdict(plan), names], sort_keys=True)
         self._digest = hashlib.sha256(text.encode()).hexdigest()
         self._started = time.perf_counter()
 
@@ -75,6 +79,7 @@ class KeptSteps:
             "features": step.features,
             "first": step.first,
             "iterations": step.iterations,
+            "continuous": step.continuous,
             "designs": [
                 {
                     "groups": list(designs.arrangement.groups),
@@ -97,8 +102,8 @@ class KeptSteps:
         plain = torch.load(path, weights_only=True)
         if plain["digest"] != self._digest:
             raise InputError(
-                f"{path.parent}: holds steps of a search with another specification or plan; "
-                "remove the folder, or choose another run folder"
+                f"{path.parent}: holds steps of a search with another specification or plan, or "
+                "with other glasses; remove the folder, or choose another run folder"
             )
         self.seconds_before = max(self.seconds_before, float(plain["seconds"]))
         designs = tuple(
@@ -114,4 +119,6 @@ class KeptSteps:
             )
             for part in plain["designs"]
         )
-        return Step(designs, plain["features"], plain["first"], plain["iterations"])
+        return Step(
+            designs, plain["features"], plain["first"], plain["iterations"], plain["continuous"]
+        )

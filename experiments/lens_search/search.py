@@ -25,7 +25,7 @@ from dolens.lens_search.course import WITHIN
 from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.growth import STAGES
-from dolens.lens_search.merit import SearchMerit
+from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.search import SearchPlan, search
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import random_starts
@@ -62,6 +62,9 @@ class LensSearchModule(Analysis):
         "search/designs",
         "search/lens_iterations",
         "search/forms_that_hold",
+        "search/glass_loss",
+        "search/secondary_spectrum_um",
+        "search/lateral_colour_um",
     )
 
     def __init__(
@@ -124,7 +127,16 @@ class LensSearchModule(Analysis):
         best = self._best.found
         fields = [(0.0, float(angle)) for angle in self.specification.fields]
         spots = spot_diagram(best.lens, fields, self.specification.wavelengths)
-        return {
+        colour = self._best.colour
+        of_colour = (
+            {}
+            if colour is None
+            else {
+                "search/secondary_spectrum_um": colour.secondary_um,
+                "search/lateral_colour_um": colour.lateral_um,
+            }
+        )
+        return of_colour | {
             "search/best_rms_spot_um": best.mean_rms_spot_um,
             "search/best_rms_spot_um_through_stop": 1e3 * float(spots.polychromatic_rms.mean()),
         }
@@ -139,13 +151,15 @@ class LensSearchModule(Analysis):
             "search/lens_iterations": float(finds.iterations),
             "search/forms_that_hold": float(sum(report.holds for report in self.reports)),
         }
+        if finds.glass_loss is not None:
+            numbers["search/glass_loss"] = finds.glass_loss
         return numbers | (self._numbers_of_best() if finds.found else {})
 
 
 def first_start(specification: Specification) -> Lens:
     """Return the most promising of a few starts as a lens: what a run keeps as its initial lens."""
     arrangement = Arrangement.of(specification, *specification.places_of_stop[0])
-    merit = SearchMerit.of(arrangement, specification, STAGES[0].rings, STAGES[0].arms)
+    merit = merit_of(arrangement, specification, STAGES[0].rings, STAGES[0].arms)
     generator = torch.Generator().manual_seed(0)
     starts = random_starts(merit, 20, generator)
     return designed_lens(arrangement, specification, starts[0], "first start")

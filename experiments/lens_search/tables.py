@@ -9,7 +9,7 @@ from dolens.lens_search.form_report import FormReport
 def form_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
     """Yield a row for each form, the best first."""
     for report in reports:
-        found, made = report.found, report.sensitivity
+        found, made, colour = report.found, report.sensitivity, report.colour
         spots = {f"rms_spot_um_{n}": spot for n, spot in enumerate(found.rms_spot_um, 1)}
         yield {
             "form": report.name,
@@ -18,6 +18,9 @@ def form_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
             **spots,
             "rms_spot_um_90_percent_as_made": "" if made is None else made.ninety_percent_um,
             "worst_tolerance": "" if made is None else made.worst,
+            "axial_colour_um": "" if colour is None else colour.axial_um,
+            "secondary_spectrum_um": "" if colour is None else colour.secondary_um,
+            "lateral_colour_um": "" if colour is None else colour.lateral_um,
             "holds": report.holds,
             "broken": report.broken,
             "glasses": report.glasses,

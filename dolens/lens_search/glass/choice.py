@@ -10,13 +10,18 @@ from dolens.optics.glass_catalog import suggestion
 from dolens.optics.glass_folders import VARIABLE
 from dolens.optics.glass_properties import CatalogueGlass, catalogue_glasses
 
+# What a glass may cost: what its catalogue says of it.  Of the first, factors count.
+DOUBLED = ("price", "density")
+COSTS = (*DOUBLED, "dn_dt", *RESISTANCES)
+
 
 @dataclass(frozen=True)
 class GlassChoice:
     """What a specification says of the glasses that may be used.
 
     Attributes:
-        catalogues: their names; a glass of the first is taken before its equals of the others.
+        catalogues: their names, none where nothing is chosen; a glass of the first is taken before
+            its equals of the others.
         names: patterns with `*` and `?`, for example `N-*` or `OHARA:S-FPL5?`, in any case.
         without: patterns of glasses that are left out.
         status: those allowed, for example `preferred`; none: any.
@@ -24,6 +29,8 @@ class GlassChoice:
         density: at most, g/cm³.
         resistance: of CR, FR, SR, AR and PR → the class at most.
         dn_dt: 1e-6/K, the least and the most dn/dT (absolute, at the d line and 20 °C).
+        costs: of `COSTS` → per cent of the merit that one step for the worse may cost: twice the
+            price or the density, one class of resistance more, 1e-6/K more of dn/dT either way.
     """
 
     catalogues: tuple[str, ...]
@@ -34,12 +41,17 @@ class GlassChoice:
     density: float | None = None
     resistance: Mapping[str, float] = field(default_factory=dict, hash=False)
     dn_dt: tuple[float, float] | None = None
+    costs: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        if not self.catalogues:
-            raise InputError("glasses: catalogues must name one at least, for example SCHOTT")
+        # Lists, as files give them, become tuples.
+        for name in ("catalogues", "names", "without", "status"):
+            object.__setattr__(self, name, tuple(getattr(self, name) or ()))
+        if self.dn_dt is not None:
+            object.__setattr__(self, "dn_dt", tuple(self.dn_dt))
         _require_known("status", self.status, STATUSES)
         _require_known("resistance", self.resistance, RESISTANCES)
+        _require_known("costs", self.costs, COSTS)
         for name, (low, high) in self.limits().items():
             if not low <= high:  # NaN, too
                 raise InputError(f"glasses: {name} from {low:g} to {high:g} leaves nothing")
@@ -77,6 +89,8 @@ def choose_glasses(choice: GlassChoice) -> ChosenGlasses:
             glass; or none of a catalogue's glasses has the status, the price or the property that
             a limit needs.
     """
+    if not choice.catalogues:
+        raise InputError("glasses: catalogues must name one at least, for example SCHOTT")
     per_catalogue = {name: catalogue_glasses(name) for name in dict.fromkeys(choice.catalogues)}
     everything = [glass for glasses in per_catalogue.values() for glass in glasses]
     for pattern in (*choice.names, *choice.without):

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.lens_search.glass.choice import DOUBLED, GlassChoice, choose_glasses
 from dolens.lens_search.glass.dispersion_coordinates import (
     DispersionBasis,
     fitted_basis,
@@ -15,16 +17,16 @@ from dolens.lens_search.glass.dispersion_coordinates import (
     nd_vd_deviation,
 )
 from dolens.lens_search.glass.region import GlassRegion, glass_region
-from dolens.optics.agf import RESISTANCES
 from dolens.optics.glass_properties import CatalogueGlass
+from dolens.optics.materials import INDEX_MODELS, parse_material
 
 # Glasses deviate from the normal line by less; what is beyond is a misprint of a catalogue.
 _LARGEST_DEVIATION = 0.1
-# What a glass may cost: what its catalogue says of it.
-COSTS = ("price", "density", "dn_dt", *RESISTANCES)
+# Glasses nearer to each other are equals: 0.001 in nd, 8e-5 in nF - nC.
+_APART = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GlassSet:
     """Glasses with their numbers 0 to K - 1.
 
@@ -61,19 +63,28 @@ class GlassSet:
         exact = self.indices.to(coordinates)[numbers.clamp(min=0)]
         return torch.where((numbers >= 0)[..., None], exact, self.basis.index(coordinates))
 
-    def costs(self, weights: Mapping[str, float]) -> Tensor:
-        """Return the weighted sum of properties of each glass, (K,).
-
-        Args:
-            weights: of `COSTS` → weight; the cost of dn/dT is that of its absolute value in 1e-6/K.
+    def points_of(self, materials: Sequence[str]) -> Tensor:
+        """Return the coordinates (n, C) of media that a prescription names.
 
         Raises:
-            InputError: there is no such property, or a glass does not give it.
+            InputError: there is no such medium, or it has no coordinates.
+        """
+        media = [parse_material(name, INDEX_MODELS["dfc"]) for name in materials]
+        points = [glass_coordinates(each)[: self.coordinates.shape[1]] for each in media]
+        return torch.tensor(points, dtype=torch.float64)
+
+    def costs(self, percent: Mapping[str, float]) -> Tensor:
+        """Return what each glass costs, (K,), as a share of a merit.
+
+        Args:
+            percent: of `COSTS` → per cent of the merit that a factor of two may cost (price,
+                density), 1e-6/K (the absolute value of dn/dT), or one class of resistance.
+
+        Raises:
+            InputError: a glass does not give a property.
         """
         total = torch.zeros_like(self.coordinates[:, 0])
-        for name, weight in weights.items():
-            if name not in COSTS:
-                raise InputError(f"cost of glass '{name}' is unknown (allowed: {', '.join(COSTS)})")
+        for name, weight in percent.items():
             values = [glass.value(name) for glass in self.glasses]
             without = [g.glass.name for g, v in zip(self.glasses, values, strict=True) if v is None]
             if without:
@@ -82,7 +93,11 @@ class GlassSet:
                     f"it, for example {without[0]}; a limit of {name} leaves them out"
                 )
             numbers = torch.tensor([v for v in values if v is not None]).to(total)
-            total = total + weight * (1e6 * numbers.abs() if name == "dn_dt" else numbers)
+            if name in DOUBLED:
+                numbers = numbers.log2()
+            elif name == "dn_dt":
+                numbers = 1e6 * numbers.abs()
+            total = total + 0.01 * weight * numbers
         return total
 
 
@@ -139,6 +154,19 @@ def glass_set(
         fitted_basis(wavelengths, media, count),
         {reason: tuple(names) for reason, names in left_out.items()},
     )
+
+
+@lru_cache(maxsize=16)
+def chosen_glasses(choice: GlassChoice, wavelengths: tuple[float, ...]) -> GlassSet:
+    """Return the glasses that a specification allows, without equals; one set for all who ask.
+
+    Raises:
+        InputError: see `choose_glasses` and `glass_set`.
+    """
+    found = glass_set(choose_glasses(choice).glasses, wavelengths, apart=_APART)
+    if choice.costs:
+        found.costs(choice.costs)  # what no glass gives is said now
+    return found
 
 
 def _first_of_equals(coordinates: Tensor, apart: float) -> list[int]:

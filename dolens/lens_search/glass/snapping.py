@@ -34,12 +34,14 @@ class Snapped:
             trial failed is not among them.
         fixed: the same before glasses were exchanged.
         continuous: the lenses at the start, optimised with continuous glasses.
+        several: the best few of each lens, different in their glasses, the best first.
         trials: how many lenses were optimised.
     """
 
     designs: Designs
     fixed: Designs
     continuous: Designs
+    several: Designs
     trials: int
 
 
@@ -82,7 +84,7 @@ def snap_glasses(
         for lens, row in zip(start.lens.tolist(), start.numbers >= 0, strict=True)
     }
     final = exchanged(work, designs, held)
-    return Snapped(_in_order(final), _in_order(designs), _in_order(continuous), work.count)
+    return Snapped(_in_order(final), _in_order(designs), _in_order(continuous), final, work.count)
 
 
 def _in_order(designs: Designs) -> Designs:

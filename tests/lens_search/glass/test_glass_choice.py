@@ -1,5 +1,7 @@
 """Which glasses a search may use: what a catalogue says of them decides, and silence is no yes."""
 
+from math import log2
+
 import pytest
 import torch
 
@@ -126,13 +128,15 @@ def test_a_set_of_glasses(own):
 def test_costs(own):
     chosen = choose_glasses(GlassChoice(("OWN",), names=("N-BK7", "F2")))
     glasses = glass_set(chosen.glasses, LINES)
-    costs = glasses.costs({"price": 2.0, "density": 0.1, "dn_dt": 0.0})
-    assert costs.tolist() == pytest.approx([2.0 + 0.251, 3.2 + 0.36])
+    costs = glasses.costs({"price": 10.0, "density": 1.0, "dn_dt": 0.0})
+    # Prices are 1 and 1.6, densities 2.51 and 3.6: their powers of two.
+    expected = [0.1 * log2(price) + 0.01 * log2(d) for price, d in ((1.0, 2.51), (1.6, 3.6))]
+    assert costs.tolist() == pytest.approx(expected)
     everything = glass_set(choose_glasses(GlassChoice(("OWN",))).glasses, LINES)
     with pytest.raises(InputError, match="2 of 4 glasses do not give it, for example OWN:N-KZFS4"):
         everything.costs({"price": 1.0})
-    with pytest.raises(InputError, match="'weight' is unknown"):
-        everything.costs({"weight": 1.0})
+    with pytest.raises(InputError, match="costs 'weight' is unknown"):
+        GlassChoice(("OWN",), costs={"weight": 1.0})
 
 
 def test_a_wavelength_beyond_the_range_of_every_glass_leaves_none(own):
