@@ -100,6 +100,7 @@ class CameraModule(Camera):
         self.costs = StepCosts()
         self.evaluation = Evaluation(miscalibrations)
         self.test_scores: dict[str, PhotographScores] = {}
+        self.validation_scores: PhotographScores | None = None  # of the last one
         self._looked_in_epoch: int | None = None
         self._shown: dict[str, Tensor] = {}  # stage → its first crop, for figures
         # Not for Lightning's strategy to average: discriminators have an optimizer of their own.
@@ -282,6 +283,8 @@ class CameraModule(Camera):
                 headline = stage in ("val", "test") and name in ("loss", "psnr_db")
                 self.log(f"{stage}/{name}", value, prog_bar=headline)
         self.test_scores.update({s: without_loss(v) for s, v in found.items() if "test" in s})
+        if "val" in found:
+            self.validation_scores = without_loss(found["val"])
 
     def summary(self) -> dict[str, float]:
         """Return the variables, intervals of scores, and costs."""

@@ -10,8 +10,11 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.centroids import reference_centroid_map
 from dolens.experiments.camera.views.field_windows import FieldWindows
 from dolens.experiments.camera.views.truth import (
+    CENTROIDS,
+    TRUTHS,
     check_truth,
     nearest_texel,
     reference_chief_ray_map,
@@ -59,7 +62,9 @@ class FieldViews(Imaging):
     With `truth` "chief_rays" the truth is the texture where the chief rays of the reference
     wavelength look: distortion, which a camera's calibration undoes, is part of it, and lateral
     colour is not.  It moves with the lens as the image does, and both carry the derivative.  With
-    "pinhole" it is what a distortion-free pinhole sees, and distortion is an error.
+    "centroids" each window's truth is moved by the centroid of its spot besides, which coma puts
+    beside the chief ray: a calibration by images undoes that too.  With "pinhole" it is what a
+    distortion-free pinhole sees, and distortion is an error.
 
     Args:
         scene: one depth, and wavelengths.
@@ -72,7 +77,7 @@ class FieldViews(Imaging):
         training_windows: `circle`: drawn evenly from the area of the circle about the sensor, so
             that the edge of the field counts by its area; `radius`: evenly from the distances to
             the middle; `area`: from the sensor, of which corners are a small part.
-        truth: `chief_rays` or `pinhole`.
+        truth: `chief_rays`, `centroids` or `pinhole`.
         seed: of windows, rendering and noise.
 
     Raises:
@@ -95,7 +100,7 @@ class FieldViews(Imaging):
         seed: int = 0,
     ) -> None:
         super().__init__(scene, renderer, readout, seed)
-        self.truth = check_truth(truth)
+        self.truth = check_truth(truth, (*TRUTHS, CENTROIDS))
         self.whole = sensor
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         window = renderer.sensor
@@ -204,7 +209,8 @@ class FieldViews(Imaging):
         if self.truth == "pinhole":
             centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
             return None, centres
-        object_points = reference_chief_ray_map(lens, values, self.scene, self.whole, windows)
+        of_windows = reference_centroid_map if self.truth == CENTROIDS else reference_chief_ray_map
+        object_points = of_windows(lens, values, self.scene, self.whole, windows)
         return object_points, [nearest_texel(rows, columns) for rows, columns in object_points]
 
     def point_spread_functions(

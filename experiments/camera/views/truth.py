@@ -17,12 +17,13 @@ from dolens.scene.texture import bilinear, texture_origin
 from dolens.sensor.pixels import Sensor
 
 TRUTHS = ("pinhole", "chief_rays")
+CENTROIDS = "centroids"
 
 
-def check_truth(name: str) -> str:
+def check_truth(name: str, allowed: Sequence[str] = TRUTHS) -> str:
     """The name itself; raises `InputError` naming the allowed ones."""
-    if name not in TRUTHS:
-        raise InputError(f"views.truth: '{name}' is unknown; allowed: {', '.join(TRUTHS)}")
+    if name not in allowed:
+        raise InputError(f"views.truth: '{name}' is unknown; allowed: {', '.join(allowed)}")
     return name
 
 
