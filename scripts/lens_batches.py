@@ -1,14 +1,16 @@
 """Times kernels over many lenses of one structure, beside one call a lens.
 
     python scripts/lens_batches.py --seconds 1.0 --threads 1
+    python scripts/lens_batches.py --device cuda
 
 Lenses have four elements and a stop, 17 variables, and 3 × 32 rays each, in double precision.  Rows
 are measured in turn, again and again, and the least time of each counts.  The last columns are the
 difference of the sums from those of one lens at a time, and the time of one iteration of the search
-(evaluation, model and bounded step) for a lens.
+(evaluation, model and bounded step) for a lens, which is always the CPU's.
 """
 
 import argparse
+import copy
 import sys
 import time
 from collections.abc import Callable
@@ -22,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.merit import SearchMerit
 from dolens.optics.jacobian import normal_equations
-from dolens.optics.lens_family import FamilyRays
+from dolens.optics.lens_family import FamilyRays, LensFamily
 from dolens.optics.rays import Rays
 from dolens.optimize.batch_least_squares import bounded_steps
 from scripts.search_parts import QUARTET
@@ -53,42 +55,57 @@ def problem(count: int) -> tuple[SearchMerit, Tensor]:
     return merit, torch.tensor(START, dtype=torch.float64) * (1.0 + 1e-4 * off)
 
 
-def measured(count: int, seconds: float) -> list[str]:
+def measured(count: int, seconds: float, device: torch.device) -> list[str]:
     """Return a row of the table for so many lenses."""
     merit, u = problem(count)
     conditions = merit.full(count)
-    values = merit.lens_values(u, merit.paraxial_of(u)[1])
+    values = merit.lens_values(u, merit.paraxial_of(u)[1]).to(device)
     rays, tangent = merit._launched(conditions)
-    target = torch.stack([torch.zeros_like(tangent), 100.0 * tangent], -1)
-    lens = merit.family.lens
+    target = torch.stack([torch.zeros_like(tangent), 100.0 * tangent], -1).to(device)
+    rays = FamilyRays(
+        rays.position.to(device),
+        rays.direction.to(device),
+        None if rays.wavelength is None else rays.wavelength.to(device),
+    )
     names = list(merit.family.columns)
+    lens = copy.deepcopy(merit.family.lens).to(device)
+    family = LensFamily(lens, names, merit.specification.wavelengths)
     # One lens as a user has it, with the numbers of the first.
     with torch.no_grad():
-        for name, where in merit.family.columns.items():
+        for name, where in family.columns.items():
             parameter = lens.variables([name])[name]
             parameter.copy_(values[0, where].reshape(parameter.shape))
     alone = Rays(rays.position[0], rays.direction[0], merit.specification.wavelengths[0])
     leaf = values.clone().requires_grad_()
 
+    def finished(call: Callable[[], object]) -> Callable[[], object]:
+        """Return the call with its end waited for."""
+
+        def timed() -> object:
+            found = call()
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            return found
+
+        return timed
+
     def gradient() -> None:
-        torch.autograd.grad(merit.family.trace(leaf, rays).position.square().sum(), leaf)
+        torch.autograd.grad(family.trace(leaf, rays).position.square().sum(), leaf)
 
     def iteration() -> None:
         model = merit.evaluate(u, conditions)
         bound = torch.full_like(u, 0.1)
         bounded_steps(model, 1e-3 * model.hessian.diagonal(dim1=1, dim2=2), -bound, bound)
 
-    found = best_of(
-        {
-            "one": lambda: normal_equations(lens, alone, names, target[0]),
-            "trace": lambda: merit.family.trace(values, rays),
-            "gradient": gradient,
-            "equations": lambda: merit.family.normal_equations(values, rays, target),
-            "iteration": iteration,
-        },
-        seconds,
-    )
-    together = merit.family.normal_equations(
+    calls: dict[str, Callable[[], object]] = {
+        "one": lambda: normal_equations(lens, alone, names, target[0]),
+        "trace": lambda: family.trace(values, rays),
+        "gradient": gradient,
+        "equations": lambda: family.normal_equations(values, rays, target),
+        "iteration": iteration,
+    }
+    found = best_of({name: finished(call) for name, call in calls.items()}, seconds)
+    together = family.normal_equations(
         values[:1], FamilyRays(rays.position[:1], rays.direction[:1], rays.wavelength), target[:1]
     )
     single = normal_equations(lens, alone, names, target[0])
@@ -99,7 +116,7 @@ def measured(count: int, seconds: float) -> list[str]:
         together.jtj[0] - single.jtj[order][:, order]
     ).abs().max() / single.jtj.abs().max()
     surfaces = merit.arrangement.surfaces
-    per = found["equations"] / (count * tangent.shape[1] * surfaces * merit.family.count)
+    per = found["equations"] / (count * tangent.shape[1] * surfaces * family.count)
     return [
         f"{count}",
         *(f"{1e6 * found[name] / count:.2f}" for name in ("trace", "gradient", "equations")),
@@ -117,6 +134,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="for each figure")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--lenses", type=int, nargs="+", default=[1, 10, 100, 1000, 10_000])
+    parser.add_argument(
+        "--device", type=torch.device, default=torch.device("cpu"), help="cpu or cuda"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     head = (
@@ -131,7 +151,10 @@ def main() -> None:
     print("| " + " | ".join(head) + " |")
     print("|" + "---|" * len(head))
     for count in arguments.lenses:
-        print("| " + " | ".join(measured(count, arguments.seconds)) + " |", flush=True)
+        print(
+            "| " + " | ".join(measured(count, arguments.seconds, arguments.device)) + " |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -23,14 +23,19 @@ from dolens.kernels.table import SurfaceTable
 
 def kernels_of(position: Tensor) -> Any:
     """Return the module that runs kernels where the rays are; it is imported when first needed."""
-    return _module(position.device.type)
+    return _module(position.device.type, "backend")
+
+
+def kernels_of_lenses(position: Tensor) -> Any:
+    """Return the module that runs kernels of many lenses where the rays are."""
+    return _module(position.device.type, "lenses")
 
 
 @cache
-def _module(kind: str) -> Any:
+def _module(kind: str, name: str) -> Any:
     if kind not in ("cpu", "cuda"):
         raise InputError(f"no kernels for rays on {kind}; use backend 'reference'")
-    return import_module(f"dolens.kernels.{kind}.backend")
+    return import_module(f"dolens.kernels.{kind}.{name}")
 
 
 @operator

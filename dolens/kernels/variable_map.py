@@ -4,6 +4,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+# Outputs that can be differentiated, and where they lie among the numbers that the kernels keep of
+# a ray, and so where their cotangents are one.
+OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}
+
 
 @dataclass(frozen=True, eq=False)
 class IndexMap:

@@ -4,16 +4,15 @@ A ray's sensor point and path length depend on no other ray, so two or three rev
 columns at once, however many variables there are.
 """
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import SurfaceTable
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
@@ -22,8 +21,6 @@ from dolens.optics.ray_tracing import FlatRays, flat_rays
 from dolens.optics.rays import Rays
 from dolens.optics.reference_jacobian import reference_jacobian, reference_sums
 from dolens.optics.system import OpticalSystem
-
-logger = logging.getLogger("dolens.kernels")
 
 OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
 
@@ -136,13 +133,12 @@ def ray_jacobian(
     parameters = lens.variables(variables)
     columns = _columns(parameters)
     system, leaves = _with_leaves(lens, parameters)
-    if not _has_kernel(system, rays):
+    if choose_backend(system, rays) == "reference":
         values, derivatives, valid = reference_jacobian(lens, rays, parameters, outputs)
         return RayJacobian(outputs, columns, values, derivatives, valid)
-    from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
     flat = flat_rays(system, rays)
     table, entries = pack_with_variables(system, flat.wavelengths, leaves)
+    kernels = kernels_of_lenses(flat.position)
     found = kernels.ray_jacobians(_alone(table), entries, outputs, _of_one_lens(flat))
     valid, values, jacobian = (part[0] for part in found)
     if flat.before is not None and "path_length" in outputs:
@@ -196,15 +192,14 @@ def normal_equations(
     if group is not None:
         group, groups = _checked_groups(group.to(lens.device), shape)
     system, leaves = _with_leaves(lens, parameters)
-    if _has_kernel(system, rays):
-        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
+    if choose_backend(system, rays) != "reference":
         flat = flat_rays(system, rays)
         table, entries = pack_with_variables(system, flat.wavelengths, leaves)
         if flat.before is not None and "path_length" in outputs:
             target = target.clone()
             target[:, outputs.index("path_length")] -= flat.before
         own = None if weight is None else weight[None]
+        kernels = kernels_of_lenses(flat.position)
         found_sums = kernels.normal_equations(
             *(_alone(table), entries, outputs, _of_one_lens(flat)),
             *(target[None], own, group, groups),
@@ -279,18 +274,3 @@ def _with_leaves(
     """The lens with leaves of their own in the place of the variables, and these."""
     leaves = {name: p.detach().requires_grad_() for name, p in parameters.items()}
     return lens.system(leaves), list(leaves.values())
-
-
-def _has_kernel(system: OpticalSystem, rays: Rays) -> bool:
-    """Return whether the CPU's kernels differentiate; on a GPU the reference does, and says so."""
-    chosen = choose_backend(system, rays)
-    if chosen == "cuda":
-        if system.backend == "cuda":
-            raise InputError("backend 'cuda' has no Jacobians; use 'auto' or 'reference'")
-        _say_reference()
-    return chosen == "cpu"
-
-
-@cache
-def _say_reference() -> None:
-    logger.info("Jacobians on a GPU: the reference in PyTorch")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
+from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import IndexMap, VariableMap
 from dolens.optics.lens import Lens
@@ -110,6 +111,12 @@ class LensFamily:
             self._table, self.map = pack_with_variables(
                 system, self.wavelengths, list(leaves.values())
             )
+        base, own = self._table.values, self.map
+        self._moves = (
+            own.places.to(base.device),
+            own.columns.to(base.device),
+            own.weights.to(base),
+        )
         self._codes: dict[int, Tensor] = {}
         self._start = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
 
@@ -136,8 +143,9 @@ class LensFamily:
         if self._has_poses:
             records = vmap(self._records_of)(values)
         else:
-            moved = values[:, self.map.columns] * self.map.weights.to(base)
-            records = base.expand(len(values), -1).clone().index_add_(1, self.map.places, moved)
+            places, columns, weights = self._moves
+            moved = values[:, columns] * weights
+            records = base.expand(len(values), -1).clone().index_add_(1, places, moved)
         if indices is None:
             indices = self._table.indices.expand(len(values), -1, -1)
         return SurfaceTable(records, indices, self._table.codes, self._table.extras)
@@ -147,21 +155,24 @@ class LensFamily:
         parts = {n: values[s].reshape(self._shapes[n]) for n, s in self.columns.items()}
         return record_values(self.lens.system(parts))
 
-    def _map_at(self, values: Tensor) -> tuple[VariableMap, Tensor | None]:
+    def _map_at(
+        self, values: Tensor, variables: VariableMap | None
+    ) -> tuple[VariableMap, Tensor | None]:
         """Return the map of the variables, and its weights (L, E) where lenses have their own."""
+        given = variables or self.map
         if not self._has_poses:
-            return self.map, None
+            return given, None
         derivatives = vmap(jacfwd(self._records_of))(values.to(self._table.values)).double()
         places, columns = (derivatives != 0.0).any(0).nonzero(as_tuple=True)
         weights = derivatives[:, places, columns]
-        return VariableMap(places, columns, weights[0], self.count), weights
+        return VariableMap(places, columns, weights[0], given.count, given.indices), weights
 
     def _which(self, rays: FamilyRays) -> Tensor | None:
         """Return each ray's column of the indices; None where there is but one wavelength."""
         if len(self.wavelengths) == 1:
             return None
         if rays.wavelength is None:
-            return torch.zeros(rays.position.shape[1], dtype=torch.int32)
+            return rays.position.new_zeros(rays.position.shape[1], dtype=torch.int32)
         return rays.wavelength
 
     def with_indices(self, rows: Tensor, columns: Tensor, count: int) -> VariableMap:
@@ -215,15 +226,13 @@ class LensFamily:
             surface: its number, from 1.
             indices: as in `table`.
         """
-        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
         if surface not in self._codes:
             system = self.lens.system()
             first = pack(system, self.wavelengths[0], 1.0, 1, surface, False)
             self._codes[surface] = first.codes
         table = replace(self.table(values, indices), codes=self._codes[surface])
         given = (rays.position, rays.direction, self._which(rays))
-        position, _, _, status, _ = kernels.trace(table, given)
+        position, _, _, status, _ = kernels_of_lenses(rays.position).trace(table, given)
         return position[..., :2], status == 0
 
     @torch.no_grad()
@@ -246,12 +255,10 @@ class LensFamily:
             variables: with indices among them, see `with_indices`; None: the family's own.
             index_derivatives: (L, E, wavelengths), of the indices with respect to these.
         """
-        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
-        own, weights = self._map_at(values)
-        found = kernels.ray_jacobians(
+        own, weights = self._map_at(values, variables)
+        found = kernels_of_lenses(rays.position).ray_jacobians(
             self.table(values, indices),
-            variables or own,
+            own,
             outputs,
             (rays.position, rays.direction, self._which(rays)),
             weights,
@@ -287,12 +294,10 @@ class LensFamily:
             variables: as in `jacobians`, and the last.
             index_derivatives: of the media.
         """
-        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
-        own, weights = self._map_at(values)
-        head, jtr, jtj, sums = kernels.normal_equations(
+        own, weights = self._map_at(values, variables)
+        head, jtr, jtj, sums = kernels_of_lenses(rays.position).normal_equations(
             self.table(values, indices),
-            variables or own,
+            own,
             outputs,
             (rays.position, rays.direction, self._which(rays)),
             target,
@@ -320,11 +325,9 @@ class _Trace(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values, indices, position, direction, which, table):  # noqa: ANN001, ANN205
-        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
-
         position = position.to(values).contiguous()
         direction = direction.to(values).contiguous()
-        found = kernels.trace(table, (position, direction, which))
+        found = kernels_of_lenses(position).trace(table, (position, direction, which))
         ctx.save_for_backward(values, indices, position, direction, found[3])
         ctx.which, ctx.codes, ctx.extras = which, table.codes, table.extras
         ctx.mark_non_differentiable(found[3], found[4])
@@ -332,11 +335,10 @@ class _Trace(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, of_position, of_direction, of_path, *_):  # noqa: ANN001, ANN002, ANN205
-        from dolens.kernels.cpu import lenses as kernels  # compiled when it was traced
-
         values, indices, position, direction, status = ctx.saved_tensors
         wanted = ctx.needs_input_grad
-        of_rays, of_directions, of_values, of_indices = kernels.trace_adjoint(
+        adjoint = kernels_of_lenses(position).trace_adjoint
+        of_rays, of_directions, of_values, of_indices = adjoint(
             SurfaceTable(values.detach(), indices.detach(), ctx.codes, ctx.extras),
             (position, direction, ctx.which),
             status,

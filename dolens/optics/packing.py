@@ -211,7 +211,7 @@ def _derivatives(
     """
     flat = torch.cat([value.reshape(-1) for _, value in functions])
     source = torch.cat([torch.arange(b, b + value.numel()) for b, value in functions])
-    jacobian = jacobian_of(flat, variables)
+    jacobian = jacobian_of(flat, variables).cpu()
     row, column = torch.nonzero(jacobian, as_tuple=True)
     return source[row].numpy(), column.numpy(), jacobian[row, column].double().numpy()
 

@@ -4,12 +4,12 @@ The reference that the kernels must equal.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.func import jacfwd
 
+from dolens.kernels.least_squares_sums import least_squares_sums
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, TracedRays
@@ -87,27 +87,25 @@ def reference_sums(
     wavelength = rays.wavelength
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.expand(rays.components().x.shape).reshape(-1)
-    p, k = sum(t.numel() for t in parameters.values()), len(outputs)
-    options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
-    head, jtr = torch.zeros(2, **options), torch.zeros(p, **options)
-    jtj = torch.zeros((p, p), **options)
-    by_group = torch.zeros((groups, 2 + k + k * p), **options)
-    size = max(1, _NUMBERS // max(1, k * p))
-    for first in range(0, len(target), size):
+    numbers = max(1, len(outputs) * sum(t.numel() for t in parameters.values()), groups)
+    size = max(1, _NUMBERS // numbers)
+    sums: tuple[Tensor, ...] = ()
+    for first in range(0, max(len(target), 1), size):
         part = slice(first, first + size)
         some = Rays.from_components(
             Components(*(c[part] for c in ray)),
             wavelength[part] if isinstance(wavelength, Tensor) else wavelength,
         )
         values, jacobian, valid = reference_jacobian(lens, some, parameters, outputs)
-        residual = torch.where(valid[:, None], values - target[part], 0.0).double()
-        w = valid.double() if weight is None else torch.where(valid, weight[part], 0.0).double()
-        jacobian = jacobian.double()
-        weighted = w[:, None, None] * jacobian
-        head += torch.stack((valid.sum(), (w[:, None] * residual.square()).sum()))
-        jtr += torch.einsum("nkp,nk->p", weighted, residual)
-        jtj += torch.einsum("nkp,nkq->pq", weighted, jacobian)
-        if group is not None:
-            row = (valid[:, None], w[:, None], w[:, None] * residual, weighted.flatten(1))
-            by_group.index_add_(0, group[part], torch.cat([r.double() for r in row], 1))
+        added = least_squares_sums(
+            valid[None],
+            values.mT[None],
+            jacobian.permute(1, 2, 0)[None],
+            target[None, part],
+            None if weight is None else weight[None, part],
+            None if group is None else group[part],
+            groups,
+        )
+        sums = tuple(a + b for a, b in zip(sums, added, strict=True)) if sums else added
+    head, jtr, jtj, by_group = (part[0] for part in sums)
     return head, jtr, jtj, by_group

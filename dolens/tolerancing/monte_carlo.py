@@ -135,13 +135,13 @@ class _Moments:
     def __call__(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return moments (K, 7, S), and shares of failed and vignetted rays (K,)."""
         rays = Rays.from_components(self.ray, self.wavelength)
-        if choose_backend(self.lens.system(), rays) == "cpu":
+        if choose_backend(self.lens.system(), rays) != "reference":
             return self._moments(*self._by_kernels(values, rays))
         return vmap(self._of_one)(values)
 
     def _by_kernels(self, values: Tensor, rays: Rays) -> tuple[Components, Tensor, Tensor]:
         """Return the rays of every lens (K, N) on its sensor, and which failed and were clipped."""
-        given = torch.as_tensor(self.wavelength, dtype=torch.float64)
+        given = torch.as_tensor(self.wavelength, dtype=torch.float64, device=values.device)
         waves, which = given.expand(self.ray.x.shape).unique(return_inverse=True)
         family = LensFamily(self.lens, self.names, waves.tolist())
         shape = (len(values), *rays.position.shape)

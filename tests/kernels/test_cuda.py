@@ -32,9 +32,10 @@ def python(root, *arguments, **environment):
 
 @compiled
 def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
-    """`tests/kernels/interpreted_cuda.py`, in a process where Triton was told before it came up."""
+    """Tests in a process where Triton was told before it came up."""
     options = ("-n", "0", "-q", "--tb=short", "-p", "no:cacheprovider")
-    tests = ["tests/kernels/interpreted_cuda.py", *options]
+    files = ("tests/kernels/interpreted_cuda.py", "tests/kernels/interpreted_lenses.py")
+    tests = [*files, *options]
     run = python(root, "-m", "pytest", *tests, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
     assert run.returncode == 0, run.stdout[-20000:] + run.stderr[-5000:]
     assert " passed" in run.stdout
@@ -73,12 +74,16 @@ def compile_for(kernel, real, kinds, surfaces, block, absent):
     from dolens.kernels.cuda.functions import shape_of
 
     numbers = "*fp64" if real == torch.float64 else "*fp32"
-    types = dict.fromkeys(("codes", "extras", "which"), "*i32") | {
+    integers = ("codes", "extras", "which", "entries", "entry_places", "entry_columns",
+                "index_rows", "index_columns", "output_rows")  # fmt: skip
+    types = dict.fromkeys(integers, "*i32") | {
         "sums": "*fp64", "status": "*i8", "out_status": "*i8", "out_surface": "*i16",
+        "out_valid": "*i8",
     }  # fmt: skip
     pointers = ("values", "media", "position", "direction", "out_position", "out_direction",
                 "out_path", "of_position", "of_direction", "of_path", "position_gradient",
-                "direction_gradient", "scratch")  # fmt: skip
+                "direction_gradient", "scratch", "weights", "index_weights", "out_values",
+                "out_jacobian", "rows")  # fmt: skip
     types |= dict.fromkeys(pointers, numbers)
     forms = tuple(
         shape_of(surface.kernel.code, kernels_of(surface.kernel.code, "cuda"))
@@ -105,6 +110,8 @@ LENSES = {
     "apertures made of figures": (SPHERES | 1 << Kind.BY_SAG, ()),
     "polynomials by recurrence": (SPHERES, (ZernikeStandard,)),
 }
+# The Jacobian's kernel is made of the same steps: these take half of a second to two.
+JACOBIANS = [("spheres", torch.float32), ("aspheres", torch.float64)]
 
 
 @compiled
@@ -127,18 +134,22 @@ def test_the_kernels_compile_and_keep_their_precision(name, real):
     The interpreter could not tell: it has no types but NumPy's.
     """
     from dolens.kernels.cuda.adjoint import adjoint_kernel
-    from dolens.kernels.cuda.backend import ADJOINT_BLOCK, FORWARD_BLOCK
     from dolens.kernels.cuda.forward import forward_kernel
+    from dolens.kernels.cuda.jacobian import jacobian_kernel
+    from dolens.kernels.cuda.launching import ADJOINT_BLOCK, FORWARD_BLOCK, JACOBIAN_BLOCK
 
     forward = compile_for(forward_kernel, real, *LENSES[name], FORWARD_BLOCK, ("which",))
     absent = ("which", "of_direction", "of_path")
     adjoint = compile_for(adjoint_kernel, real, *LENSES[name], ADJOINT_BLOCK[real], absent)
+    kernels = [forward, adjoint]
+    if (name, real) in JACOBIANS:
+        kernels.append(compile_for(jacobian_kernel, real, *LENSES[name], JACOBIAN_BLOCK, ()))
     bits = 64 if real == torch.float64 else 32
-    for ptx in (forward, adjoint):
+    for ptx in kernels:
         assert f"div.rn.f{bits}" in ptx and f"sqrt.rn.f{bits}" in ptx
         assert not re.search(r"\b(div|sqrt|rcp|rsqrt)\.(approx|full)|\.ftz", ptx)
         assert not re.search(r"\b(fma|mul|div|sqrt)\S*\.f" + str(96 - bits), ptx)
     # Sums alone are in double precision.
     if real == torch.float32:
-        assert "f64" not in forward
+        assert not any("f64" in ptx for ptx in kernels if ptx != adjoint)
         assert re.search(r"add\S*\.f64", adjoint)

@@ -12,10 +12,8 @@ from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER
 from dolens.kernels.cpu.program import Program, functions_of
 from dolens.kernels.table import Code, Slot, SurfaceTable
-from dolens.kernels.variable_map import VariableMap
+from dolens.kernels.variable_map import OUTPUT_ROWS, VariableMap
 
-# Where an output lies among a state's rows, and so where its cotangent is one.
-OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}
 # Sums are kept for this many chunks, or fewer where they would take more numbers than that.
 _CHUNKS, _NUMBERS = 64, 1 << 23
 
@@ -34,7 +32,7 @@ class Derivatives:
     Args:
         table: the lens, up to the sensor.
         variables: P of them.
-        outputs: K names of `OUTPUT_ROWS`.
+        outputs: K names of `dolens.kernels.variable_map.OUTPUT_ROWS`.
         rays: position (N, 3), direction (N, 3), and wavelength's column (N,), int32, or None.
         chunk: rays of a chunk.
         further: rows of a block that the driver needs beside the columns.

@@ -139,7 +139,7 @@ def ray_jacobians(
     Args:
         table: as in `trace`.
         variables: P of them, of E entries, the same for all lenses.
-        outputs: K names of `dolens.kernels.cpu.derivatives.OUTPUT_ROWS`.
+        outputs: K names of `dolens.kernels.variable_map.OUTPUT_ROWS`.
         rays: as in `trace`.
         weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
         index_derivatives: (L, entries, wavelengths), float64, for `variables.indices`.

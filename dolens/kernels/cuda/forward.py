@@ -17,8 +17,9 @@ from dolens.kernels.cuda.step import step
 
 # One compiled kernel serves bundles of any size, strides and alignment.
 _VARYING = (
-    "exit_place", "wavelengths", "steps", "count", "position_row", "position_column",
-    "direction_row", "direction_column",
+    "values_lens", "exit_place", "media_lens", "wavelengths", "steps", "count", "blocks",
+    "position_lens", "position_row", "position_column",
+    "direction_lens", "direction_row", "direction_column",
 )  # fmt: skip
 
 
@@ -26,30 +27,40 @@ _VARYING = (
     do_not_specialize=_VARYING, do_not_specialize_on_alignment=("position", "direction", "which")
 )
 def forward_kernel(
-    values, exit_place, media, wavelengths, codes, extras, steps, count,
-    position, position_row, position_column, direction, direction_row, direction_column, which,
+    values, values_lens, exit_place, media, media_lens, wavelengths, codes, extras,
+    steps, count, blocks, position, position_lens, position_row, position_column,
+    direction, direction_lens, direction_row, direction_column, which,
     out_position, out_direction, out_path, out_status, out_surface,
     KINDS: tl.constexpr, FORMS: tl.constexpr, LAWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Trace `count` rays; see `dolens.kernels.cuda.backend.trace`.
+    """Trace `count` rays of each lens; see `dolens.kernels.cuda.lenses.trace`.
 
     Args:
-        values: the table's records.
+        values: the records of the first lens.
+        values_lens: numbers from a lens to the next one's; and so on.
         exit_place: where in `values` the number lies that is added to z in the end.
         media: (steps, 3, wavelengths): index in front, ratio μ, and λ/2π of a deflection.
+        media_lens: as `values_lens`.
         wavelengths: columns of `media`.
         codes: (steps, ROW), int32.
         extras: int32.
         steps: rows of `codes`.
-        count: rays.
+        count: rays of a lens.
+        blocks: of rays of a lens; a program takes one.
         position: (count, 3), with its strides; and so on for the direction.
         which: (count,), int32, or None.
-        out_position: and the other results, contiguous.
+        out_position: and the other results, (lenses, count, ...), contiguous.
         KINDS: see `step`, and FORMS and LAWS.
         BLOCK: rays a program.
     """
-    rays = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    program = tl.program_id(0).to(tl.int64)
+    lens = program // blocks
+    rays = (program % blocks) * BLOCK + tl.arange(0, BLOCK)
     mask = rays < count
+    values += lens * values_lens
+    media += lens * media_lens
+    position += lens * position_lens
+    direction += lens * direction_lens
     x, y, z = load_vectors(position, position_row, position_column, rays, mask, 0.0)
     sense = first_sense(values, steps)
     l, m, n = load_vectors(direction, direction_row, direction_column, rays, mask, sense)
@@ -82,6 +93,7 @@ def forward_kernel(
             LAWS,
         )
     z = z + tl.load(values + exit_place)
+    rays += lens * count
     # Rays that are not valid may overflow.
     store_vectors(out_position, rays, mask, finite(x), finite(y), finite(z))
     store_vectors(out_direction, rays, mask, finite(l), finite(m), finite(n))

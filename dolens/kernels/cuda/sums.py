@@ -2,6 +2,9 @@
 
 A program adds in the order of its blocks, with no atomic operations, so that a repeated call gives
 the same bits.  Rays that are not `alive` may hold anything, NaN too, and do not count.
+
+Jacobians need what each ray adds.  Their rows belong to one ray each: a place is then a block of
+pointers, one for every ray, and nothing is summed over them.
 """
 
 import triton
@@ -10,9 +13,14 @@ import triton.language as tl
 
 @triton.jit
 def add_sum(place, numbers, alive):
-    """Add the sum over the rays that are alive to the number at `place`."""
-    total = tl.sum(tl.where(alive, numbers, 0.0), 0)
-    tl.store(place, tl.load(place) + total.to(tl.float64))
+    """Add the sum over the rays that are alive to the number at `place`; or what each ray adds to
+    the number at its own place, in the rays' precision.
+    """
+    counted = tl.where(alive, numbers, 0.0)
+    if place.type.is_block():
+        tl.store(place, tl.load(place) + counted)
+    else:
+        tl.store(place, tl.load(place) + tl.sum(counted, 0).to(tl.float64))
 
 
 @triton.jit

@@ -1,0 +1,123 @@
+"""A kernel reads a table's codes from the rays' device, and the indices that every step meets."""
+
+import logging
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from triton.runtime.interpreter import InterpretedFunction
+
+from dolens.cached_tensors import cached_tensors
+from dolens.errors import InputError
+from dolens.kernels.cuda.forward import forward_kernel
+from dolens.kernels.cuda.functions import LawShape, SagFunctions, Shape, law_of, shape_of
+from dolens.kernels.cuda.layout import WITH_FIGURES
+from dolens.kernels.law_kernel import law_kernels_of
+from dolens.kernels.surface_kernel import kernels_of
+from dolens.kernels.table import Code, Kind, SurfaceTable
+
+logger = logging.getLogger("dolens.kernels")
+
+
+class DeviceCodes(NamedTuple):
+    """A kernel reads these integers of a table, on the rays' device.
+
+    Attributes:
+        codes: (steps, Code.ROW), int32.
+        extras: int32; the table's, and behind them what shapes have made of them.
+        before: (steps,), int64, rows of the indices; and after.
+        after: and behind.
+        kinds: bit k is set where there is a step of kind k, and one where there are figures.
+        forms: of the surfaces given by their sag; see `functions.shape_of`.
+        waves: (steps,), int64, the row of the indices that holds λ/2π; 0 where a step needs none.
+        laws: of deflection; see `functions.law_of`.
+    """
+
+    codes: Tensor
+    extras: Tensor
+    before: Tensor
+    after: Tensor
+    kinds: int
+    forms: tuple[Shape, ...]
+    waves: Tensor
+    laws: tuple[LawShape, ...]
+
+
+@cached_tensors(maxsize=128)
+def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
+    """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
+    rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
+    own = np.frombuffer(extras, dtype=np.int64).tolist()
+    device_extras, kinds, forms, laws = list(own), 0, set(), set()
+    for row in rows:
+        kind = row[Code.KIND]
+        if kind < Kind.BY_SAG:
+            kinds |= 1 << kind
+        if row[Code.FIGURES]:
+            kinds |= WITH_FIGURES
+        if kind == Kind.DEFLECT:
+            laws.add(law_of(row[Code.LAW], law_kernels_of(row[Code.LAW], "cuda")))
+            kind = row[Code.BASE]
+        if kind < Kind.BY_SAG:
+            continue
+        functions: SagFunctions = kernels_of(kind, "cuda")
+        forms.add(shape_of(kind, functions))
+        further = functions.extras(row, own)
+        if further is not None:
+            row[Code.EXTRAS] = len(device_extras)
+            device_extras += further
+    table = torch.tensor(rows, dtype=torch.int32).reshape(-1, Code.ROW)
+    return DeviceCodes(
+        table.to(device),
+        torch.tensor(device_extras, dtype=torch.int32).to(device),
+        table[:, Code.BEFORE].long().to(device),
+        table[:, Code.AFTER].long().to(device),
+        kinds,
+        tuple(sorted(forms, key=lambda form: form[0])),
+        table[:, Code.WAVE].long().to(device),
+        tuple(sorted(laws, key=lambda law: law[0])),
+    )
+
+
+def prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
+    """Return the codes of lenses of one structure, and their media (L, steps, 3, wavelengths):
+    index in front, ratio, and λ/2π of the steps that need it, in the rays' precision.
+
+    Args:
+        table: `values` (L, V) and `indices` (L, media, wavelengths).  Indices that all lenses
+            share (a stride of zero) are shared by the media.
+        like: a tensor of the rays.
+
+    Raises:
+        InputError: rays that are not on a GPU, outside Triton's interpreter.
+    """
+    if like.device.type != "cuda" and not isinstance(forward_kernel, InterpretedFunction):
+        raise InputError(
+            f"Triton's kernels run on a GPU, not on {like.device} (or set TRITON_INTERPRET=1, "
+            "to test them)"
+        )
+    codes = _device_codes(
+        table.codes.numpy().tobytes(), table.extras.numpy().tobytes(), like.device
+    )
+    lenses = len(table.indices)
+    indices = table.indices[:1] if table.indices.stride(0) == 0 else table.indices
+    front = indices[:, codes.before]
+    ratio = front / indices[:, codes.after]
+    media = torch.stack((front, ratio, indices[:, codes.waves]), 2).to(like.dtype)
+    return codes, media.expand(lenses, -1, -1, -1)
+
+
+@cache
+def _announce() -> None:
+    logger.info(
+        "compiling kernels for the GPU (some seconds a lens, unless Triton's cache has them)"
+    )
+
+
+def on(device: torch.device) -> AbstractContextManager[object]:
+    """Launch there, whichever GPU is the current one."""
+    _announce()
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
