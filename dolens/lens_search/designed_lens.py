@@ -13,8 +13,9 @@ from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription
 
-# Edges of elements beyond the edge of the beam, as a share of its height.
-_MARGIN = 1.05
+# Edges of elements over the height of the beam.  A polynomial may turn steeply where no ray passes,
+# and where light may be vignetted the edges are what clips it.
+_MARGIN, _TIGHT = 1.05, 1.005
 
 
 def designed_lens(
@@ -53,16 +54,17 @@ def designed_lens(
             height = abs(float(found.marginal[number] + zero)) * radius
             height += abs(float(found.chief[number] + zero)) * field
             height *= float(conditions.beam[0, number])
-            row = {"type": "plane"}
+            row, margin = {"type": "plane"}, _TIGHT if specification.vignetting else _MARGIN
             if arrangement.is_asphere(number):
+                margin = _TIGHT
                 terms = enumerate(numbers.coefficients[number])
                 row = asphere(
                     curvature or 1e-12 / f, [float(a) / f ** (2 * n + 3) for n, a in terms]
                 )
             elif curvature != 0.0:
                 row = {"type": "sphere", "radius": 1.0 / curvature}
-                height = min(height, 0.99 / abs(curvature) / _MARGIN)
-            row["semi_diameter"] = _MARGIN * height
+                height = min(height, 0.99 / abs(curvature) / margin)
+            row["semi_diameter"] = margin * height
         if gaps[place] is not None:
             row["thickness"] = gaps[place]
         medium = media[place]

@@ -5,7 +5,7 @@ coefficients of aspheres likewise in units of f.  The merit is Σ_fields ω·(RM
 Σ (weight·deviation)².
 """
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -13,60 +13,20 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement, parameter_names, template
+from dolens.lens_search.chief_rays import chief_ray_angles, distortion
+from dolens.lens_search.conditions import Conditions, paraxial_pupils
 from dolens.lens_search.operands import paraxial_operands
 from dolens.lens_search.paraxial import LensNumbers, Paraxial, numbers_of, paraxial
 from dolens.lens_search.search_rays import SearchRays, launched, search_rays
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
+from dolens.lens_search.variable_bounds import variable_bounds
 from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
 from dolens.optimize.batch_least_squares import BatchModel
 
 # Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
 # curved surface leaves it by the step's square: weights near one leave steps no room.
 OPERAND_WEIGHT = 0.03
-# Of one term of an asphere, over the focal length.
-_MOST_BEND = 2.0
-# Limits are aimed at from within: the rays that a lens is checked with lie between those here.
-_WITHIN = 0.999
-
-
-# Shift, scale, bend, dip, scale across and keystone of a circle about the axis.
-PARAXIAL_PUPIL = (0.0, 1.0, 0.0, 0.0, 1.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What a lens is asked at some stage of its growth.
-
-    Attributes:
-        f_number: (L,).
-        field: (L,), factor of the tangents of the field angles.
-        field_weights: (L, F), ω.
-        shifts: (L, O), added to the deviations of operands: the multipliers of the augmented
-            Lagrangian over twice the weight, which let operands hold exactly at a small weight.
-        pupils: (L, F, 6), where the beam of each field crosses the plane of the entrance pupil;
-            see `dolens.lens_search.real_pupils`.
-        beam: (L, S + 1), the beam's real height on each surface, and that of the axial beam at the
-            stop, over its paraxial one.
-    """
-
-    f_number: Tensor
-    field: Tensor
-    field_weights: Tensor
-    shifts: Tensor
-    pupils: Tensor
-    beam: Tensor
-
-    def chosen(self, which: Tensor) -> "Conditions":
-        """Return those of some lenses."""
-        return Conditions(
-            self.f_number[which],
-            self.field[which],
-            self.field_weights[which],
-            self.shifts[which],
-            self.pupils[which],
-            self.beam[which],
-        )
 
 
 @dataclass(frozen=True)
@@ -120,7 +80,7 @@ class SearchMerit:
             torch.ones(lenses, dtype=torch.float64),
             torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
             torch.zeros((lenses, self.operands), dtype=torch.float64),
-            torch.tensor(PARAXIAL_PUPIL, dtype=torch.float64).expand(lenses, fields, -1),
+            paraxial_pupils(self.specification, self.rays).expand(lenses, -1, -1),
             torch.ones((lenses, self.arrangement.surfaces + 1), dtype=torch.float64),
         )
 
@@ -136,42 +96,13 @@ class SearchMerit:
         one = torch.ones(1, dtype=torch.float64)
         beam = torch.ones((1, self.arrangement.surfaces + 1), dtype=torch.float64)
         _, _, limits = self._paraxial_operands(u, one, one, beam)
-        return torch.tensor([*limits, *([True] * (self._distortions + self._chief_ray_angles))])
-
-    @property
-    def _distortions(self) -> int:
-        """Return the number of operands that hold the distortion."""
-        return 0 if self.specification.limits.distortion is None else self.rays.chiefs
-
-    @property
-    def _chief_ray_angles(self) -> int:
-        """Return the number of operands that hold the angles of chief rays at the sensor."""
-        return 0 if self.specification.limits.chief_ray_angle is None else self.rays.chiefs
+        held = self.specification.limits
+        real = (held.distortion, held.chief_ray_angle).count(None)
+        return torch.tensor([*limits, *([True] * ((2 - real) * self.rays.chiefs))])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the box of the variables u, (P,) each."""
-        f, limits = self.specification.focal_length, self.specification.limits
-        a = self.arrangement
-        lower, upper = [-20.0] * a.surfaces, [20.0] * a.surfaces
-        place_of_stop = a.stop_place
-        for gap, medium in enumerate(a.gap_media):
-            low, high = limits.glass if medium >= 0 else limits.air
-            if gap in (place_of_stop - 1, place_of_stop):
-                # Two gaps about the stop make one space; the stop may touch a lens.
-                low = 0.5 * low
-            lower.append(low / f)
-            upper.append(2.0 if high is None else high / f)
-        lower.append(limits.back_focus / f)
-        upper.append(3.0)
-        # A single term bends the edge of the axial beam at the entrance pupil by so much at most.
-        axial = 0.5 / self.specification.f_number
-        widest = [_MOST_BEND / axial ** (1 - power) for power in a.powers[a.image_column + 1 :]]
-        lower += [-most for most in widest]
-        upper += widest
-        return (
-            torch.tensor(lower, dtype=torch.float64),
-            torch.tensor(upper, dtype=torch.float64),
-        )
+        return variable_bounds(self.arrangement, self.specification)
 
     def box(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the boxes of lenses u, (P,) or (L, P) each: the same for all here."""
@@ -289,17 +220,30 @@ class SearchMerit:
             self.rays.groups,
         )
         deviations, rows = [first_order[:, 1:]], [of_first_order[:, 1:]]
-        limit = self.specification.limits.distortion
-        if limit is not None and self._distortions:
-            deviation, row = self._distortion(sums, tangent, of_pupil, limit)
+        for deviation, row in self._of_chief_rays(u, pupil, rays, tangent, sums):
             deviations.append(deviation)
-            rows.append(row)
-        if self._chief_ray_angles:
-            deviation, row = self._chief_ray_angle(u, pupil, of_pupil, rays)
-            deviations.append(deviation)
-            rows.append(row)
+            rows.append(self._row_in_variables(row, of_pupil[:, None]))
         usable = (sums.count == tangent.shape[1]) & torch.isfinite(pupil)
         return _Evaluated(sums, torch.cat(deviations, 1), torch.cat(rows, 1), of_pupil, usable)
+
+    def _of_chief_rays(
+        self, u: Tensor, pupil: Tensor, rays: FamilyRays, tangent: Tensor, sums: FamilySums
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield deviations (L, C) of real chief rays, and their derivatives (L, C, P + 1) with
+        respect to the family's variables.
+        """
+        chiefs, limits = self.rays.chiefs, self.specification.limits
+        if limits.distortion is not None and chiefs:
+            ideal = self.specification.focal_length * tangent[:, -chiefs:]
+            yield distortion(sums, self.rays, ideal, limits.distortion)
+        if limits.chief_ray_angle is not None and chiefs:
+            chief = FamilyRays(
+                rays.position[:, -chiefs:],
+                rays.direction[:, -chiefs:],
+                self.rays.wavelength[-chiefs:],
+            )
+            values = self.lens_values(u, pupil)
+            yield chief_ray_angles(self.family, values, chief, limits.chief_ray_angle)
 
     def spots(self, u: Tensor, conditions: Conditions) -> Tensor:
         """Return the RMS spot radii (L, F), mm, about centroids; infinite where a ray fails."""
@@ -342,36 +286,6 @@ class SearchMerit:
             pupil = 0.0 * numbers.image
         rows = torch.cat([pupil.rows[None], operands.rows])
         return rows[:, 0].T, rows[:, 1:].permute(2, 0, 1), limits
-
-    def _distortion(
-        self, sums: FamilySums, tangent: Tensor, of_pupil: Tensor, limit: float
-    ) -> tuple[Tensor, Tensor]:
-        """Return how far distortion exceeds its limit (L, C), and derivatives (L, C, P)."""
-        f = self.specification.focal_length
-        fields = self.rays.fields
-        ideal = f * tangent[:, -self.rays.chiefs :]
-        share = sums.group_residual[:, fields:, 1] / ideal
-        row = sums.group_jacobian[:, fields:, 1] / ideal[..., None]
-        row = self._row_in_variables(row, of_pupil[:, None])
-        return share.abs() - _WITHIN * limit, share.sign()[..., None] * row
-
-    def _chief_ray_angle(
-        self, u: Tensor, pupil: Tensor, of_pupil: Tensor, rays: FamilyRays
-    ) -> tuple[Tensor, Tensor]:
-        """Return by how much the sines of chief rays' angles at the sensor exceed their limit
-        (L, C), and derivatives (L, C, P).
-        """
-        count = self._chief_ray_angles
-        chief = FamilyRays(
-            rays.position[:, -count:], rays.direction[:, -count:], self.rays.wavelength[-count:]
-        )
-        found = self.family.jacobians(self.lens_values(u, pupil), chief, ("m",))
-        sine = found.values[:, 0]
-        row = self._row_in_variables(found.derivatives[:, 0].mT, of_pupil[:, None])
-        limit = self.specification.limits.chief_ray_angle
-        assert limit is not None  # it is counted
-        most = math.sin(math.radians(_WITHIN * limit))
-        return sine.abs() - most, sine.sign()[..., None] * row
 
     def _row_in_variables(self, row: Tensor, of_pupil: Tensor) -> Tensor:
         """Return derivatives (..., L, P) with respect to u from those (..., L, P + 1) with respect

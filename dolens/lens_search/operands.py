@@ -84,9 +84,11 @@ def paraxial_operands(
             found.append(limits.air_edge / f - (gap + side * sag))
     last = arrangement.surfaces - 1
     if arrangement.is_asphere(last):
-        # An asphere's edge may come nearer to the sensor than its vertex.
-        sag = sags(arrangement, lenses, [last], heights[[last]])
-        found.append(limits.air_edge / f - (Tangents.stacked([lenses.image]) - sag))
+        # It may come nearer to the sensor than its vertex.
+        at = Tangents(torch.cat([zone * heights[[last]].rows for zone in _ZONES]))
+        sag = sags(arrangement, lenses, len(_ZONES) * [last], at)
+        room = Tangents.stacked([lenses.image]).rows.repeat(len(_ZONES), 1, 1)
+        found.append(limits.back_focus / f - (Tangents(room) - sag))
     every = Tangents(torch.cat([part.rows for part in found]))
     return every, [False] + [True] * (len(every.rows) - 1)
 

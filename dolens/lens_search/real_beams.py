@@ -21,7 +21,7 @@ from dolens.optics.surfaces.clear_aperture import Unlimited
 # Field heights from the axis to the edge, and rays through the stop, besides those on its rim.
 FIELDS, RAYS = 21, 400
 # Radii at which the distance between two surfaces is taken.
-_RADII = 65
+RADII = 65
 # What a drawn surface reaches beyond the rays.
 _MARGIN = 1.02
 
@@ -150,9 +150,9 @@ def spaces(lens: Lens, heights: Tensor) -> tuple[Space, ...]:
     for first, last in pairwise(refracting):
         glass = is_glass(lens.materials[first])
         reach = [edges[n] for n in (first, last)]
-        radii = torch.linspace(0.0, 1.0, _RADII, dtype=torch.float64)
+        radii = torch.linspace(0.0, 1.0, RADII, dtype=torch.float64)
         radii = radii * (max(reach) if glass else min(reach))
-        front, back = (_sag(lens, n, radii.clamp(max=float(heights[n - 1]))) for n in (first, last))
+        front, back = (sag(lens, n, radii.clamp(max=float(heights[n - 1]))) for n in (first, last))
         centre = vertices[last - 1] - vertices[first - 1]
         found.append(Space(first, last, glass, centre, float((centre + back - front).amin())))
     return tuple(found)
@@ -194,6 +194,7 @@ def _element_heights(lens: Lens, refracting: list[int], heights: Tensor) -> dict
     return found | {n: float(heights[n - 1]) for n in group}
 
 
-def _sag(lens: Lens, number: int, radii: Tensor) -> Tensor:
+def sag(lens: Lens, number: int, radii: Tensor) -> Tensor:
+    """Return the sag of a surface, counted from 1, at radii (N,), mm."""
     surface = lens.system().surfaces[number - 1].double()
     return surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(radii), radii)[0]

@@ -2,11 +2,12 @@
 
 Where the entrance pupil has aberrations the beam of a field does not cross its plane in the
 paraxial circle.  Rays at the middle of the stop and at five points of its rim say where it does:
-the point (px, py) of the stop, in radii, is reached from
+the point (px, h·py) of the stop, in radii, is reached from
 
     x = r·px·(d + k·py),   y = r·(a + b·py + c·py² + e·px²)
 
-on the plane of the paraxial entrance pupil of radius r.  These six numbers of each field are held
+on the plane of the paraxial entrance pupil of radius r, with h < 1 where a part of the field's beam
+may be vignetted.  These six numbers of each field are held
 while a lens is optimised, and found anew between rounds.
 """
 
@@ -15,11 +16,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.lens_search.merit import Conditions, SearchMerit
+from dolens.lens_search.conditions import Conditions, beam_heights
+from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.search_rays import launched, through_points
 from dolens.optics.lens_family import FamilyRays
 
-# Of the stop, in radii: the middle, and the rim above, below, at the side and between these.
+# Of the beam at the stop, in its half axes: the middle, and the rim above, below, at the side and
+# between these.
 _SLANT = 0.5**0.5
 _PROBES = torch.tensor(
     [[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [_SLANT, _SLANT], [_SLANT, -_SLANT]],
@@ -51,8 +54,7 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
     values = merit.lens_values(u, pupil)
     radius = 0.5 * f / conditions.f_number
     fields = merit.rays.fields
-    slopes = torch.stack([merit.rays.tangent[merit.rays.field == n][0] for n in range(fields)])
-    tangent = (conditions.field[:, None] * slopes).repeat_interleave(len(_PROBES), 1)
+    tangent = (conditions.field[:, None] * merit.rays.slopes).repeat_interleave(len(_PROBES), 1)
     wavelength = torch.full((tangent.shape[1],), merit.specification.reference, dtype=torch.int32)
     stop = merit.arrangement.stop_place + 2
 
@@ -61,10 +63,12 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
         return merit.family.intercepts(values, FamilyRays(position, direction, wavelength), surface)
 
     # The stop is as wide as the axial beam is there.
-    rim = radius[:, None, None] * _PROBES.repeat(fields, 1)
+    heights = beam_heights(merit.specification, merit.rays).repeat_interleave(len(_PROBES))
+    probes = torch.stack([_PROBES[:, 0].repeat(fields), heights * _PROBES[:, 1].repeat(fields)], -1)
+    rim = radius[:, None, None] * probes
     on_axis, _ = at(rim, stop)
     stop_radius = on_axis[:, 1, 1]
-    wanted = stop_radius[:, None, None] * _PROBES.repeat(fields, 1)
+    wanted = stop_radius[:, None, None] * probes
     magnification = (first_order.stop_height + zero)[:, None, None]
     points, arrived = rim, on_axis
     slope = magnification.expand_as(points)
@@ -111,7 +115,8 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
         beam.append(there.norm(dim=-1).amax(-1) / f / expected)
     beam.append((stop_radius / (radius * (first_order.stop_height + zero))).abs())
     factors = _ROOM * torch.stack(beam, -1)
-    found &= ((factors > _LEAST) & (factors < _MOST)).all(-1)
+    least = _LEAST * (1.0 - merit.specification.vignetting)
+    found &= ((factors > least) & (factors < _MOST)).all(-1)
     return replace(
         conditions,
         pupils=torch.where(found[:, None, None], believed, conditions.pupils),

@@ -15,7 +15,8 @@ class Requirements:
         f_number: of the real marginal ray, 1/(2·sin u').
         f_number_error: the share by which it may be off.
         total_track: mm, at most, from the first vertex to the sensor.
-        back_focus: mm, at least, from the last vertex to the sensor.
+        back_focus: mm, at least, from the last refracting surface to the sensor: from its vertex,
+            and from an asphere anywhere within the beam.
         glass_centre: mm, least and largest thickness of glass on the axis.
         glass_edge: mm, the least thickness of glass at its edge.
         air_centre: mm, least and largest air space on the axis.
@@ -24,7 +25,7 @@ class Requirements:
             beam; below zero its plane lies within glass, and its rim is that of the surface.
         distortion: per cent of f·tan θ, at most, either way.
         chief_ray_angle: degrees to the axis at the sensor, at most.
-        vignetting: the share of a field's light that may be clipped.
+        vignetting: the share of a field's light that may be lost, clipped or by rays that fail.
         rms_spot_um: µm, of any field from the axis to the edge.
     """
 
@@ -45,13 +46,8 @@ class Requirements:
     rms_spot_um: float | None = None
 
     @classmethod
-    def of(cls, specification: Specification, vignetting: float | None = 0.0) -> "Requirements":
-        """Return what the specification of a search asks of its lenses.
-
-        Args:
-            specification: of the search.
-            vignetting: the share of a field's light that may be clipped; None for any.
-        """
+    def of(cls, specification: Specification) -> "Requirements":
+        """Return what the specification of a search asks of its lenses."""
         limits = specification.limits
         distortion = None if limits.distortion is None else 100.0 * limits.distortion
         return cls(
@@ -65,5 +61,5 @@ class Requirements:
             air_edge=limits.air_edge,
             distortion=distortion,
             chief_ray_angle=limits.chief_ray_angle,
-            vignetting=vignetting,
+            vignetting=specification.vignetting,
         )

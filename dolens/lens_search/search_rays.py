@@ -44,6 +44,11 @@ class SearchRays:
         """Return the number of groups."""
         return self.fields + self.chiefs
 
+    @property
+    def slopes(self) -> Tensor:
+        """Return the tangents of the field angles, (F,)."""
+        return torch.stack([self.tangent[self.group == n][0] for n in range(self.fields)])
+
     def at_rim(self, azimuths: int) -> "SearchRays":
         """Return rays of all fields and wavelengths through the half rim of the pupil.
 
@@ -54,11 +59,10 @@ class SearchRays:
         points = torch.stack([azimuth.cos(), azimuth.sin()], -1)
         beams = torch.unique(torch.stack([self.field, self.wavelength]), dim=1)
         field, wavelength = beams.repeat_interleave(azimuths, 1)
-        slopes = torch.stack([self.tangent[self.group == n][0] for n in range(self.fields)])
         count = len(field)
         return SearchRays(
             points.repeat(beams.shape[1], 1),
-            slopes[field],
+            self.slopes[field],
             torch.ones(count, dtype=torch.float64),
             field,
             wavelength.to(torch.int32),

@@ -22,7 +22,8 @@ class Limits:
         air: least and greatest air space on the axis.
         glass_edge: least thickness of an element at the edge of the beam.
         air_edge: least air space there.
-        back_focus: least distance from the last vertex to the sensor.
+        back_focus: least distance from the last surface to the sensor: from its vertex, and from an
+            asphere anywhere within the beam.
         track: greatest distance from the first surface, or a stop in front of it, to the sensor.
         slope: greatest angle of an asphere within the beam with the plane across the axis, degrees.
         distortion: greatest |h/h₀ - 1| of the chief ray's height h at the sensor, h₀ = f·tan θ.
@@ -83,6 +84,8 @@ class Specification:
         asphere_terms: coefficients of r⁴, r⁶, ... of both surfaces of each element; a single number
             is that of all, 0 for spheres.  A cemented surface has those of the element in front of
             it.  An asphere's conic constant is -1: its sag is a polynomial, wherever the beam goes.
+        vignetting: share of the light through the stop that apertures may clip at the outermost
+            field; of one whose tangent is the share t of its tangent they may clip t² times that.
         limits: what must be kept.
     """
 
@@ -96,6 +99,7 @@ class Specification:
     reference_wavelength: float | None = None
     stop_in_glass: bool = False
     asphere_terms: tuple[int, ...] = (0,)
+    vignetting: float = 0.0
     limits: Limits = field(default_factory=Limits)
     glass_choice: GlassChoice | None = None
 
@@ -136,6 +140,8 @@ class Specification:
             raise InputError(
                 f"asphere_terms: from 0 to {MOST_TERMS} each, not {list(self.asphere_terms)}"
             )
+        if not 0.0 <= self.vignetting < 1.0:
+            raise InputError(f"vignetting must lie from 0 to below 1, not {self.vignetting}")
         wrong = [stop for stop in self.stops if not 0 <= stop <= len(self.groups)]
         if wrong:
             raise InputError(f"stops: from 0 to {len(self.groups)}, not {wrong[0]}")

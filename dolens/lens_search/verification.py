@@ -10,13 +10,24 @@ from dolens.analysis.conditions import Conditions, conditions
 from dolens.analysis.parabasal import parabasal_rays
 from dolens.analysis.rms_curves import rms_against_field
 from dolens.errors import InputError
-from dolens.lens_search.real_beams import FIELDS, RAYS, RealBeams, Space, real_beams, spaces
+from dolens.lens_search.real_beams import (
+    FIELDS,
+    RADII,
+    RAYS,
+    RealBeams,
+    Space,
+    real_beams,
+    sag,
+    spaces,
+)
 from dolens.lens_search.requirements import Requirements
 from dolens.optics.lens import Lens
 
 # A merit function meets limits only nearly.  So much may be missing, as a share of the limit, or of
 # 1 mm, 1° or 1 % where the limit is less.
 _ALLOWED = 1e-3
+# Kinds of surfaces whose vertex says how far they are from the sensor, as designers count it.
+_WITHOUT_TURNS = ("plane", "sphere", "conic")
 # Names of the least and largest thickness on the axis, and of the least one out to the edge.
 _GLASS = ("thinnest glass", "thickest glass", "thinnest edge of glass")
 _AIR = ("smallest air space", "largest air space", "smallest air to the edge")
@@ -142,8 +153,21 @@ def _first_order(
         ),
         _about("F-number", number, "", required.f_number, required.f_number_error),
         Check("total track", float(vertices[-1]), "mm", most=required.total_track),
-        Check("back focus", float(lens.sensor_distance), "mm", least=required.back_focus),
+        Check("back focus", _back_focus(lens, beams), "mm", least=required.back_focus),
     ]
+
+
+def _back_focus(lens: Lens, beams: RealBeams) -> float:
+    """Return the distance from the last refracting surface to the sensor, mm: from its vertex, and
+    from an asphere anywhere within the beam.
+    """
+    last = beams.refracting[-1]
+    vertices = lens.system().vertices
+    distance = float(vertices[-1] - vertices[last - 1])
+    if lens.surfaces[str(last)].kind in _WITHOUT_TURNS:
+        return distance
+    radii = torch.linspace(0.0, 1.0, RADII, dtype=torch.float64) * beams.heights[last - 1]
+    return distance - float(sag(lens, last, radii).amax())
 
 
 def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
@@ -190,9 +214,12 @@ def _crossing(lens: Lens, beams: RealBeams, stop_to_glass: float | None) -> list
 
 def _light(beams: RealBeams, required: Requirements) -> list[Check]:
     checks = []
+    # Where light may be lost, it does not matter how.
+    allowed = required.vignetting
+    lost = beams.failed + beams.vignetted
     for name, shares, most in (
-        ("rays that fail", beams.failed, 0.0),
-        ("vignetting", beams.vignetted, required.vignetting),
+        ("rays that fail", beams.failed, allowed),
+        ("vignetting", lost if allowed else beams.vignetted, allowed),
     ):
         at = int(shares.argmax())
         place = _field(beams, at) if float(shares[at]) > 0.0 else ""

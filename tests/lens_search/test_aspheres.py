@@ -20,6 +20,7 @@ from dolens.lens_search.search_rays import half_pupil
 from dolens.lens_search.specification import Limits, Specification
 from dolens.lens_search.starts import random_starts
 from dolens.lens_search.tangents import Tangents
+from dolens.optics.surfaces.clear_aperture import Circle
 
 # Two plastic lenses of a small camera; the first is spherical in front of its cemented neighbour.
 CAMERA = Specification(
@@ -103,7 +104,12 @@ def test_a_form_counts_an_asphere_as_its_lens_does():
     arrays = Designs(
         ARRANGEMENT, u, torch.zeros(1, 3), torch.zeros(1), torch.zeros(1), (("start",),)
     ).arrays(merit)
-    written = lens_arrays(designed_lens(ARRANGEMENT, CAMERA, u[0], "camera"))
+    lens = designed_lens(ARRANGEMENT, CAMERA, u[0], "camera")
+    for surface in list(lens.surfaces.values())[
+        1:
+    ]:  # real beams may be lower than the paraxial one
+        surface.aperture = replace(surface.aperture, edge=Circle(10.0))
+    written = lens_arrays(lens)
     height = arrays.heights[0] * CAMERA.focal_length
     torch.testing.assert_close(
         height[1:], written.heights[0, 1:], rtol=1e-6, atol=1e-9

@@ -13,6 +13,7 @@ from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.neighbours import inserted, taken_out
 from dolens.lens_search.paraxial import numbers_of, paraxial
+from dolens.lens_search.real_beams import real_beams
 from dolens.lens_search.real_pupils import with_real_beams
 from dolens.lens_search.search_rays import half_pupil
 from dolens.lens_search.specification import Limits, Specification
@@ -129,6 +130,27 @@ def test_spots_of_real_beams_are_those_of_the_lens_through_its_stop():
     # Paraxial circles of the pupil are another beam.
     paraxial_spots = merit.spots(u, merit.full(1))[0]
     assert float((paraxial_spots / exact - 1.0).abs().max()) > 0.03
+
+
+def test_apertures_clip_as_much_light_as_may_be_vignetted():
+    """The outermost beam is an ellipse of 0.7 of the stop's area; the axial one loses nothing."""
+    specification = replace(
+        QUARTET, wavelengths=(587.5618,), glasses=("1.5168/64.17",), vignetting=0.3
+    )
+    merit = SearchMerit.of(ARRANGEMENT, specification, 8, 16)
+    numbers = [*(100.0 / radius for radius in RADII), *(gap / 100.0 for gap in GAPS)]
+    u = torch.tensor([numbers], dtype=torch.float64)
+    lens = designed_lens(ARRANGEMENT, specification, u[0], "made")
+    beams = real_beams(lens, count=3)
+    assert float(beams.vignetted[0]) == 0.0 and float(beams.failed.max()) == 0.0
+    assert 0.05 < float(beams.vignetted[-1]) <= 0.3
+    # The ellipse of the merit is within the light that passes: its spots are no larger than that
+    # of the whole stop, whose outermost rays are aberrated most.
+    vignetted = merit.spots(u, with_real_beams(merit, u, merit.full(1)))[0]
+    whole = replace(merit, specification=replace(specification, vignetting=0.0))
+    open_spots = whole.spots(u, with_real_beams(whole, u, whole.full(1)))[0]
+    assert float(vignetted[0] / open_spots[0]) == pytest.approx(1.0, rel=1e-9)
+    assert float(vignetted[-1]) < float(open_spots[-1])
 
 
 @pytest.mark.parametrize(("rings", "arms"), [(2, 4), (3, 6), (4, 8)])

@@ -187,9 +187,16 @@ def test_what_cannot_be_computed_keeps_no_limit():
 
 def test_requirements_follow_from_the_specification_of_a_search():
     specification = Specification(
-        100.0, 3.0, (0.0, 15.0), (587.5618,), (1, 1), ("1.5168",), limits=Limits(track=250.0)
+        100.0,
+        3.0,
+        (0.0, 15.0),
+        (587.5618,),
+        (1, 1),
+        ("1.5168",),
+        limits=Limits(track=250.0),
+        vignetting=0.3,
     )
-    required = Requirements.of(specification, vignetting=None)
+    required = Requirements.of(specification)
     assert (required.focal_length, required.f_number, required.total_track) == (100.0, 3.0, 250.0)
     assert required.distortion == 1.0 and required.glass_centre == (2.0, 120.0)
-    assert required.vignetting is None
+    assert required.vignetting == 0.3

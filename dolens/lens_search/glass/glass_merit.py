@@ -13,12 +13,13 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import AIR
+from dolens.lens_search.conditions import Conditions
 from dolens.lens_search.glass.dispersion_coordinates import material_text
 from dolens.lens_search.glass.drawn_glasses import drawn_glasses
 from dolens.lens_search.glass.glass_set import GlassSet
 from dolens.lens_search.glass.own_glasses import FREE, HELD, FamilyOfGlasses
 from dolens.lens_search.glass.region import GlassRegion
-from dolens.lens_search.merit import Conditions, SearchMerit
+from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import LensNumbers, Paraxial, numbers_of, paraxial
 from dolens.lens_search.tangents import Tangents
 from dolens.optimize.batch_least_squares import BatchModel
@@ -185,7 +186,7 @@ class GlassMerit(SearchMerit):
         """
         waves = self.specification.wavelengths
         short, long = (waves.index(edge(waves)) for edge in (min, max))
-        blue, red = (torch.stack(self.numbers_at(u, n).indices) for n in (short, long))
+        blue, red = (torch.stack(list(self.numbers_at(u, n).indices)) for n in (short, long))
         return (blue - red).T
 
     # ---------------------------------------------------------------- values

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from dolens.lens_search.conditions import Conditions
 from dolens.lens_search.glass.designs import GlassModel, GlassTrials, Reoptimise, Reoptimised
 from dolens.lens_search.glass.glass_merit import GlassMerit
 from dolens.lens_search.glass.glass_models import glass_models
 from dolens.lens_search.glass.own_glasses import FREE
-from dolens.lens_search.merit import Conditions
 from dolens.optimize.batch_least_squares import BatchModel, minimise_batch
 
 # A free glass this near to a wall leans on it, and a variable this near to a bound on that.
