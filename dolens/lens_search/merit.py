@@ -235,7 +235,8 @@ class SearchMerit:
         chiefs, limits = self.rays.chiefs, self.specification.limits
         if limits.distortion is not None and chiefs:
             ideal = self.specification.focal_length * tangent[:, -chiefs:]
-            yield distortion(sums, self.rays, ideal, limits.distortion)
+            waves = bool(self.arrangement.aspheres)
+            yield distortion(sums, self.rays, ideal, limits.distortion, waves)
         if limits.chief_ray_angle is not None and chiefs:
             chief = FamilyRays(
                 rays.position[:, -chiefs:],
