@@ -4,10 +4,13 @@ Surfaces are spheres, conics and even aspheres on one axis.  A ray starts in the
 entrance pupil, or is aimed at the stop's own rim by Newton's method.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from mpmath import mp, mpf
+from numpy.typing import NDArray
 
 from lens_search.plain_lens import PlainLens, entrance_pupil
 from lens_search.plain_trace import PupilRays
@@ -16,6 +19,8 @@ mp.dps = 80
 Triple = tuple[mpf, mpf, mpf]
 _SMALL = mp.mpf(10) ** -70
 _STEP = mp.mpf(10) ** -30
+# At which the first crossing of an asphere is looked for.
+_SAMPLES = 1001
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,17 @@ class ExactLens:
         squared = along * along - c * (1 + self.conic[k] * dz * dz) * across
         if squared <= 0 or along + mp.sqrt(squared) <= 0:
             raise Fails
-        far = across / (along + mp.sqrt(squared))
-        if not self.terms[k]:
-            return far
+        return across / (along + mp.sqrt(squared))
+
+    def _meet_asphere(self, k: int, point: Triple, direction: Triple) -> mpf:
+        """Return the path from a point to the first crossing of an asphere within its edge; to one
+        near its conic where it has no edge.
+        """
+        dx, dy, dz = direction
+        if math.isfinite(self.lens.rows[k].edge):
+            far = mp.mpf(self._first_crossing(k, point, direction))
+        else:
+            far = self._meet(k, point, direction)
         for _ in range(100):
             at = [p + far * d for p, d in zip(point, direction, strict=True)]
             value, slope = self.sag(k, at[0] ** 2 + at[1] ** 2)
@@ -84,6 +97,28 @@ class ExactLens:
             if abs(step) < _SMALL:
                 return far
         raise Fails
+
+    def _first_crossing(self, k: int, point: Triple, direction: Triple) -> float:
+        """Return the path to the first crossing nearly: a polynomial can have several."""
+        c, one = float(self.curvature[k]), 1.0 + float(self.conic[k])
+
+        def sag(r: NDArray[np.float64]) -> NDArray[np.float64]:
+            root = np.sqrt(np.maximum(1.0 - one * (c * r) ** 2, 0.0))
+            terms = (float(a) * r**power for power, a in self.terms[k].items())
+            return c * r**2 / (1.0 + root) + sum(terms)
+
+        edge = self.lens.rows[k].edge
+        sags = sag(np.linspace(0.0, edge, _SAMPLES))
+        x, y, z = map(float, point)
+        dx, dy, dz = map(float, direction)
+        room = 1e-3 * edge
+        far = np.linspace(sags.min() - room - z, sags.max() + room - z, _SAMPLES) / dz
+        radius = np.hypot(x + far * dx, y + far * dy)
+        above = np.where(radius < edge, z + far * dz - sag(radius), np.nan)
+        (found,) = np.nonzero((above[:-1] <= 0.0) & (above[1:] > 0.0))
+        if not len(found):
+            raise Fails
+        return float(far[found[0]])
 
     def trace(self, point: Triple, direction: Triple, last: int | None = None) -> Ray:
         """Trace a ray, to surface `last` alone where it is given.
@@ -98,7 +133,8 @@ class ExactLens:
         """
         before, points, paths = mp.mpf(1), [], []
         for k, index in enumerate(self.index):
-            far = self._meet(k, point, direction)
+            meet = self._meet_asphere if self.terms[k] else self._meet
+            far = meet(k, point, direction)
             x, y, z = (p + far * d for p, d in zip(point, direction, strict=True))
             points.append((x, y))
             paths.append(far)

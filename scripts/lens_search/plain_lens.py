@@ -4,6 +4,7 @@ It reads the YAML by itself.  Only the index of a glass that is given by a catal
 of dolens; air is 1, and nd/Vd is n = A + B/λ² on the C, d and F lines (index model `dfc`).
 """
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,13 +20,16 @@ _SHAPES = ("sphere", "conic", "asphere", "even_asphere", "plane", "aperture")
 
 @dataclass(frozen=True)
 class Row:
-    """A surface: curvature (1/mm), conic constant, power → coefficient, gap behind it (mm)."""
+    """A surface: curvature (1/mm), conic constant, power → coefficient, gap behind it (mm), medium,
+    and semi-diameter (mm).
+    """
 
     curvature: float
     conic: float
     terms: dict[int, float]
     gap: float
     material: str
+    edge: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class PlainLens:
         if None in found:
             from dolens import load_lens
 
-            behind = load_lens(self.path).indices(wavelength)[1:]
+            behind = [m.index(wavelength) for m in load_lens(self.path).materials[1:]]
             found = [float(n) if own is None else own for own, n in zip(found, behind, strict=True)]
         return found
 
@@ -128,6 +132,7 @@ def _row(entry: dict[str, Any], gap: float, path: Path) -> Row:
         terms,
         gap,
         str(entry.get("material", "air")),
+        float(edge) if isinstance(edge := entry.get("semi_diameter"), int | float) else math.inf,
     )
 
 
