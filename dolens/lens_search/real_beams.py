@@ -196,5 +196,11 @@ def _element_heights(lens: Lens, refracting: list[int], heights: Tensor) -> dict
 
 def sag(lens: Lens, number: int, radii: Tensor) -> Tensor:
     """Return the sag of a surface, counted from 1, at radii (N,), mm."""
+    return sag_and_slope(lens, number, radii)[0]
+
+
+def sag_and_slope(lens: Lens, number: int, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sag of a surface, counted from 1, at radii (N,), mm, and its derivative."""
     surface = lens.system().surfaces[number - 1].double()
-    return surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(radii), radii)[0]
+    found = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(radii), radii)
+    return found[0], found[2]

@@ -25,6 +25,7 @@ class Requirements:
             beam; below zero its plane lies within glass, and its rim is that of the surface.
         distortion: per cent of f·tan θ, at most, either way.
         chief_ray_angle: degrees to the axis at the sensor, at most.
+        slope: degrees, of an asphere within the beam, to the plane across the axis.
         vignetting: the share of a field's light that may be lost, clipped or by rays that fail.
         rms_spot_um: µm, of any field from the axis to the edge.
     """
@@ -42,6 +43,7 @@ class Requirements:
     stop_to_glass: float | None = None
     distortion: float | None = None
     chief_ray_angle: float | None = None
+    slope: float | None = None
     vignetting: float | None = 0.0
     rms_spot_um: float | None = None
 
@@ -61,5 +63,6 @@ class Requirements:
             air_edge=limits.air_edge,
             distortion=distortion,
             chief_ray_angle=limits.chief_ray_angle,
+            slope=limits.slope,
             vignetting=specification.vignetting,
         )

@@ -18,6 +18,7 @@ from dolens.lens_search.real_beams import (
     Space,
     real_beams,
     sag,
+    sag_and_slope,
     spaces,
 )
 from dolens.lens_search.requirements import Requirements
@@ -129,6 +130,7 @@ def verify(
         *_first_order(lens, where, required, beams),
         *_thicknesses(spaces(lens, beams.heights), required),
         *_crossing(lens, beams, required.stop_to_glass),
+        *_slopes(lens, beams, required.slope),
         *_light(beams, required),
         *_image(lens, where, required, beams, rays),
     ]
@@ -210,6 +212,21 @@ def _crossing(lens: Lens, beams: RealBeams, stop_to_glass: float | None) -> list
         stop, clear = f"surface {lens.stop}", beams.stop_clearance
         checks.append(Check("stop to glass", clear, "mm", least=stop_to_glass, place=stop))
     return checks
+
+
+def _slopes(lens: Lens, beams: RealBeams, limit: float | None) -> list[Check]:
+    """Return the steepest slope of an asphere within the beams; nothing without aspheres."""
+    found = []
+    for number in beams.refracting:
+        if lens.surfaces[str(number)].kind in _WITHOUT_TURNS:
+            continue
+        radii = torch.linspace(0.0, 1.0, RADII, dtype=torch.float64) * beams.heights[number - 1]
+        steepest = sag_and_slope(lens, number, radii)[1].abs().amax()
+        found.append((math.degrees(math.atan(float(steepest))), number))
+    if not found:
+        return []
+    value, number = max(found)
+    return [Check("steepest slope", value, "°", most=limit, place=f"surface {number}")]
 
 
 def _light(beams: RealBeams, required: Requirements) -> list[Check]:

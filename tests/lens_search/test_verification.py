@@ -178,6 +178,39 @@ def test_surfaces_are_drawn_as_far_as_their_beams_go():
     assert drawn.surfaces["1"].semi_diameter == 3.0
 
 
+def test_an_asphere_is_checked_within_its_beam():
+    """A plane plate with r⁴ behind it, in a beam of 10 mm: z = a·r⁴ has the slope 4a·r³ at the rim,
+    and comes nearer to the sensor by its sag there.
+    """
+    lens = lens_from_prescription(
+        {
+            "stop": 1,
+            "wavelengths": [587.5618],
+            "fields": {"angles": [[0.0, 0.0], [0.0, 0.1]]},
+            "surfaces": {
+                "1": {"type": "plane", "semi_diameter": 5.0, "thickness": 1e-3, "material": "1.5"},
+                "2": {
+                    "type": "even_asphere",
+                    "radius": 1e12,
+                    "a4": 1e-3,
+                    "semi_diameter": 6.0,
+                    "material": "air",
+                },
+            },
+            "sensor": {"distance": 3.0, "diameter": 50.0},
+        },
+        dtype=torch.float64,
+        where="plate",
+    )
+    found = verify(lens, Requirements(slope=20.0, back_focus=2.5, vignetting=None), 2, 40)
+    height = float(found.beams.heights[1])
+    assert height == pytest.approx(5.0, rel=1e-3)
+    slope = math.degrees(math.atan(4e-3 * height**3))
+    assert found.value("steepest slope") == pytest.approx(slope, rel=1e-9)
+    assert found.value("back focus") == pytest.approx(3.0 - 1e-3 * height**4, rel=1e-9)
+    assert {"steepest slope", "back focus"} <= {check.name for check in found.broken}
+
+
 def test_what_cannot_be_computed_keeps_no_limit():
     assert Check("track", math.nan, "mm", most=1.0).holds is False
     assert Check("track", math.nan, "mm").holds is None
