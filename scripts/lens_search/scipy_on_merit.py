@@ -1,0 +1,174 @@
+"""SciPy's global optimizers on the merit function of a search, with its bounds and exact gradients.
+
+    python scripts/lens_search/scipy_on_merit.py search_triplet --stop 2 --seconds 60 --seeds 3
+
+The merit is that of the last stage: Σ of squared spots of all fields and squared deviations of the
+specification, weighted as the search does at its end.  Differential evolution has a population of
+15 lenses a variable, evaluated as one batch; basin hopping, dual annealing and random restarts
+descend by L-BFGS-B with the merit's gradient, one lens at a time.  Each has so many seconds of
+processor time on one core, then its best is fitted once more by the search's own finish, so that a
+row says how good the basin is that was found.  A lens counts that keeps its operands to a thousandth.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import basinhopping, differential_evolution, dual_annealing, minimize
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from search_parts import task
+
+from dolens.lens_search.arrangement import Arrangement
+from dolens.lens_search.growth import settled
+from dolens.lens_search.merit import SearchMerit
+
+Array = NDArray[np.float64]
+# What a lens counts whose rays fail.
+_FAILED = 1.0
+_TOLERANCE = 1e-3
+
+
+class OutOfTimeError(Exception):
+    """The processor time is used up."""
+
+
+class Objective:
+    """The logarithm of the merit, with its gradient; it remembers the best lens.
+
+    Args:
+        merit: of the search.
+        seconds: of processor time.
+    """
+
+    def __init__(self, merit: SearchMerit, seconds: float) -> None:
+        self.merit, self.seconds = merit, seconds
+        self.started, self.count = time.process_time(), 0
+        self.best, self.where = np.inf, None
+
+    def both(self, u: Array) -> tuple[Array, Array]:
+        """Return values (L,) and gradients (L, P) of lenses u (L, P)."""
+        if time.process_time() - self.started > self.seconds:
+            raise OutOfTimeError
+        lenses = torch.from_numpy(np.ascontiguousarray(u))
+        model = self.merit.evaluate(lenses, self.merit.full(len(u)))
+        fine = torch.isfinite(model.merit)
+        value = torch.where(fine, model.merit, _FAILED)
+        slope = torch.where(fine[:, None], model.gradient / value[:, None], 0.0)
+        self.count += len(u)
+        found = value.log().numpy()
+        if found.min() < self.best:
+            self.best, self.where = float(found.min()), u[int(found.argmin())].copy()
+        return found, 2.0 * slope.numpy()
+
+    def one(self, u: Array) -> tuple[float, Array]:
+        """Return the value and the gradient of one lens."""
+        value, slope = self.both(u[None])
+        return float(value[0]), slope[0]
+
+
+Method = Callable[[Objective, list[tuple[float, float]], int], None]
+
+
+def evolution(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
+    """Run SciPy's differential evolution."""
+    differential_evolution(
+        lambda u: of.both(u.T)[0],
+        bounds,
+        rng=seed,
+        vectorized=True,
+        updating="deferred",
+        maxiter=10**9,
+        tol=0.0,
+        polish=False,
+    )
+
+
+def annealing(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
+    """Run SciPy's dual annealing."""
+    local = {"method": "L-BFGS-B", "jac": lambda u: of.one(u)[1], "bounds": bounds}
+    dual_annealing(lambda u: of.one(u)[0], bounds, rng=seed, maxiter=10**9, minimizer_kwargs=local)
+
+
+def hopping(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
+    """Run SciPy's basin hopping from random lenses, a new one after thirty hops."""
+    random, ends = np.random.default_rng(seed), np.array(bounds)
+    local = {"method": "L-BFGS-B", "jac": True, "bounds": bounds}
+    while True:
+        start = random.uniform(*ends.T)
+        basinhopping(of.one, start, niter=30, stepsize=0.1, minimizer_kwargs=local, rng=random)
+
+
+def restarts(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
+    """Descend from random lenses."""
+    random, ends = np.random.default_rng(seed), np.array(bounds)
+    while True:
+        minimize(of.one, random.uniform(*ends.T), jac=True, method="L-BFGS-B", bounds=bounds)
+
+
+METHODS: dict[str, Method] = {
+    "differential evolution": evolution,
+    "dual annealing": annealing,
+    "basin hopping": hopping,
+    "random restarts": restarts,
+}
+
+
+def _bounds(merit: SearchMerit, curved: float) -> list[tuple[float, float]]:
+    lower, upper = (end.clone() for end in merit.bounds())
+    surfaces = merit.arrangement.surfaces
+    lower[:surfaces], upper[:surfaces] = -curved, curved
+    return list(zip(lower.tolist(), upper.tolist(), strict=True))
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("experiment")
+    parser.add_argument("--stop", type=int, required=True, help="behind so many groups")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--curved", type=float, default=5.0, help="curvatures over 1/f at most")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    specification, plan = task(arguments.experiment)
+    arrangement = Arrangement.of(specification, arguments.stop)
+    merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
+    bounds = _bounds(merit, arguments.curved)
+    print("| method | runs | lenses | mean RMS spots of those that keep the limits, µm |")
+    print("|---|---|---|---|")
+    for name, method in METHODS.items():
+        spots, counts = [], []
+        for seed in range(arguments.seeds):
+            of = Objective(merit, arguments.seconds)
+            with suppress(OutOfTimeError):
+                method(of, bounds, seed)
+            counts.append(of.count)
+            spots.append(_finished(merit, of.where, plan.finish_rounds, plan.finish_iterations))
+        words = ", ".join("none" if spot is None else f"{spot:.4g}" for spot in spots)
+        print(f"| {name} | {len(spots)} | {statistics.median(counts):.2g} | {words} |", flush=True)
+
+
+def _finished(merit: SearchMerit, u: Array | None, rounds: int, iterations: int) -> float | None:
+    """Return the mean RMS spot, µm, of a lens after the search's own finish; None where it breaks
+    its specification.
+    """
+    if u is None:
+        return None
+    done = settled(merit, torch.from_numpy(u)[None], rounds, iterations)
+    deviations = done.merit.deviations(done.values, done.conditions)
+    broken = torch.where(done.merit.is_limit, deviations.clamp(min=0.0), deviations.abs()).amax()
+    spot = 1e3 * float(done.merit.spots(done.values, done.conditions).mean())
+    return spot if float(broken) < _TOLERANCE and np.isfinite(spot) else None
+
+
+if __name__ == "__main__":
+    main()
