@@ -7,7 +7,8 @@ specification, weighted as the search does at its end.  Differential evolution h
 15 lenses a variable, evaluated as one batch; basin hopping, dual annealing and random restarts
 descend by L-BFGS-B with the merit's gradient, one lens at a time.  Each has so many seconds of
 processor time on one core, then its best is fitted once more by the search's own finish, so that a
-row says how good the basin is that was found.  A lens counts that keeps its operands to a thousandth.
+row says how good the basin is that was found.  A lens counts that keeps its operands to a
+thousandth.
 """
 
 import argparse
