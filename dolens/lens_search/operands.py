@@ -116,19 +116,22 @@ def _to_the_edge(
     """Return the heights on surfaces and on those behind them at the zones, zone by zone; of a lens
     without aspheres at the edge alone.
 
-    Spheres go on to the higher of the two beams.  An asphere ends with its beam, and is flat from
-    there to the edge of its element, which is as high as the highest beam on its surfaces; air is
-    looked at up to the lower of two edges.
+    Glass ends with its beams: from there a flat leads out to the edge of the element, as high as
+    the highest beam on its surfaces.  In air, spheres go on to the higher of the two beams, and
+    aspheres, with their flats, to the lower of the two edges.
     """
     own, other = heights[list(surfaces)], heights[[n + 1 for n in surfaces]]
-    higher = own.maximum(other)
-    if not arrangement.aspheres:
-        return higher, higher
-    elements = _element_heights(arrangement, heights)
-    higher = elements[list(surfaces)]
-    lower = _least(higher, elements[[n + 1 for n in surfaces]])
     glass = torch.tensor([arrangement.media_behind[n] != AIR for n in surfaces])[:, None, None]
-    edge = torch.where(glass, higher.rows, lower.rows)
+    if not arrangement.aspheres:
+        higher = own.maximum(other).rows
+        return (
+            Tangents(torch.where(glass, own.rows, higher)),
+            Tangents(torch.where(glass, other.rows, higher)),
+        )
+    elements = _element_heights(arrangement, heights)
+    higher_edge = elements[list(surfaces)]
+    lower = _least(higher_edge, elements[[n + 1 for n in surfaces]])
+    edge = torch.where(glass, higher_edge.rows, lower.rows)
     every = Tangents(torch.cat([zone * edge for zone in _ZONES]))
     return _least(every, own), _least(every, other)
 
