@@ -27,7 +27,7 @@ from dolens.optics.jacobian import normal_equations
 from dolens.optics.lens_family import FamilyRays, LensFamily
 from dolens.optics.rays import Rays
 from dolens.optimize.batch_least_squares import bounded_steps
-from scripts.search_parts import QUARTET
+from scripts.search_parts import task
 
 START = [
     *(1.082, 0.344, -1.127, -0.978, 1.847, -0.787, -2.688, 0.312),
@@ -49,7 +49,8 @@ def best_of(calls: dict[str, Callable[[], object]], seconds: float) -> dict[str,
 
 def problem(count: int) -> tuple[SearchMerit, Tensor]:
     """Return the merit of a quartet, and so many lenses near one that exists."""
-    merit = SearchMerit.of(Arrangement(QUARTET.groups, 2), QUARTET)
+    specification, _ = task("search_quartet")
+    merit = SearchMerit.of(Arrangement(specification.groups, 2), specification)
     generator = torch.Generator().manual_seed(0)
     off = torch.randn(count, len(START), generator=generator, dtype=torch.float64)
     return merit, torch.tensor(START, dtype=torch.float64) * (1.0 + 1e-4 * off)
