@@ -34,7 +34,8 @@ ALLOWED = {
         *("cached_tensors", "errors", "stages", "optics", "kernels", "scene", "sensor"),
         *("analysis", "diffraction"),
     },
-    "optimize": {"errors", "typed_values", "optics", "analysis", "rendering"},
+    # Bounded steps of thousands of lenses are a kernel.
+    "optimize": {"errors", "typed_values", "kernels", "optics", "analysis", "rendering"},
     "tolerancing": {"errors", "tasks", "optics", "analysis"},
     "alignment": {
         *("errors", "typed_values", "optics", "sensor", "rendering", "analysis", "diffraction"),

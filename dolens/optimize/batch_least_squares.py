@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.cpu import bounded_steps as kernel
 
 # A step is taken when it lowers the merit by this part of what the model predicts, or more.
 _LEAST_GAIN = 1e-4
@@ -21,7 +22,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e10
 # A variable that moves nothing is damped as if it moved this part of what the strongest does.
 _LEAST_COLUMN = 1e-10
 # Turns that exchange whole blocks of variables with their bounds, and all turns.
-_BLOCKS, _TURNS = 3, 24
+_BLOCKS, _TURNS = 3, 400
 
 
 @dataclass(frozen=True)
@@ -243,6 +244,15 @@ def bounded_steps(model: BatchModel, damping: Tensor, lower: Tensor, upper: Tens
         lower: of the steps, (n, P), at most 0.
         upper: likewise, at least 0.
     """
+    if model.gradient.device.type == "cpu" and model.gradient.dtype == torch.float64:
+        return kernel.bounded_steps(model.hessian, model.gradient, damping, lower, upper)
+    return bounded_steps_by_torch(model, damping, lower, upper)
+
+
+def bounded_steps_by_torch(
+    model: BatchModel, damping: Tensor, lower: Tensor, upper: Tensor
+) -> Tensor:
+    """Return what `bounded_steps` does, by PyTorch's operations, on any device."""
     matrix = model.hessian + torch.diag_embed(damping)
     gradient = model.gradient
     # Of each variable: -1 on its lower bound, +1 on its upper one, 0 free.

@@ -9,6 +9,7 @@ from dolens.optimize.batch_least_squares import (
     BatchModel,
     Ended,
     bounded_steps,
+    bounded_steps_by_torch,
     minimise_batch,
     predicted_gain,
 )
@@ -95,16 +96,17 @@ def test_trials_where_it_cannot_be_evaluated_are_refused():
     assert 0.75 < float(found.values[0, 0]) <= 0.8
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_bounded_step_is_the_minimum_of_its_model_in_the_box(seed):
+@pytest.mark.parametrize("steps", [bounded_steps, bounded_steps_by_torch])
+@pytest.mark.parametrize(("seed", "size"), [(0, 5), (1, 5), (2, 1), (3, 41)])
+def test_a_bounded_step_is_the_minimum_of_its_model_in_the_box(seed, size, steps):
     generator = torch.Generator().manual_seed(seed)
-    root = torch.randn(50, 6, 5, generator=generator, dtype=torch.float64)
-    gradient = torch.randn(50, 5, generator=generator, dtype=torch.float64)
+    root = torch.randn(50, size + 1, size, generator=generator, dtype=torch.float64)
+    gradient = torch.randn(50, size, generator=generator, dtype=torch.float64)
     model = BatchModel(torch.full((50,), 10.0).double(), gradient, root.mT @ root)
-    damping = torch.full((50, 5), 0.1, dtype=torch.float64)
-    lower = -0.3 * torch.rand(50, 5, generator=generator, dtype=torch.float64)
-    upper = 0.3 * torch.rand(50, 5, generator=generator, dtype=torch.float64)
-    step = bounded_steps(model, damping, lower, upper)
+    damping = torch.full((50, size), 0.1, dtype=torch.float64)
+    lower = -0.3 * torch.rand(50, size, generator=generator, dtype=torch.float64)
+    upper = 0.3 * torch.rand(50, size, generator=generator, dtype=torch.float64)
+    step = steps(model, damping, lower, upper)
     assert bool(((step >= lower) & (step <= upper)).all())
     slope = torch.einsum("npq,nq->np", model.hessian + torch.diag_embed(damping), step) + gradient
     # Kuhn and Tucker: no slope where free, and one that presses outwards on a bound.
@@ -112,7 +114,7 @@ def test_a_bounded_step_is_the_minimum_of_its_model_in_the_box(seed):
     assert float(torch.where(free, slope, 0.0).abs().max()) < 1e-9
     assert bool(((step > lower) | (slope >= -1e-9)).all())
     assert bool(((step < upper) | (slope <= 1e-9)).all())
-    assert bool((~free).any(-1).double().mean() > 0.9)
+    assert bool((~free).any(-1).double().mean() > 0.5)
     assert bool((predicted_gain(model, step) > 0.0).all())
 
 
