@@ -18,8 +18,9 @@ from dolens.lens_search.tangents import Tangents
 
 # Shares of the beam's height at which aspheres, and the spaces beside them, are looked at.
 _ZONES = (0.35, 0.55, 0.7, 0.8, 0.9, 0.95, 1.0)
-# What spaces beside aspheres have in reserve, since they may be thinner between these.
-_RESERVE = 0.002
+# What spaces have in reserve over the focal length: limits hold nearly, and spaces beside aspheres
+# may be thinner between these heights.
+_RESERVE, _RESERVE_OF_ASPHERES = 0.0002, 0.002
 
 
 def paraxial_operands(
@@ -65,7 +66,7 @@ def paraxial_operands(
         for n, _ in spaces
     ]
     least_over_f = torch.tensor(least, dtype=torch.float64)[:, None] / f
-    least_over_f = least_over_f + (_RESERVE if arrangement.aspheres else 0.0)
+    least_over_f = least_over_f + (_RESERVE_OF_ASPHERES if arrangement.aspheres else _RESERVE)
     zones = len(_ZONES) if arrangement.aspheres else 1
     surfaces = [n for n, _ in spaces]
     before, behind = _to_the_edge(arrangement, heights, surfaces)
@@ -91,7 +92,7 @@ def paraxial_operands(
         at = Tangents(torch.cat([zone * heights[[last]].rows for zone in _ZONES]))
         sag = sags(arrangement, lenses, len(_ZONES) * [last], at)
         room = Tangents.stacked([lenses.image]).rows.repeat(len(_ZONES), 1, 1)
-        found.append(limits.back_focus / f + _RESERVE - (Tangents(room) - sag))
+        found.append(limits.back_focus / f + _RESERVE_OF_ASPHERES - (Tangents(room) - sag))
     every = Tangents(torch.cat([part.rows for part in found]))
     return every, [False] + [True] * (len(every.rows) - 1)
 
