@@ -33,7 +33,7 @@ _STEPS = 6
 _MISSED = 1e-3
 # Of the half rim whose rays say how wide beams are; others reach a little farther.
 _AZIMUTHS = 9
-_ROOM = 1.001
+_ROOM = 1.003
 # Real beams beyond these factors of the paraxial ones are not believed either.
 _LEAST, _MOST = 0.5, 2.0
 
