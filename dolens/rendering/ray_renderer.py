@@ -29,9 +29,8 @@ from dolens.rendering.pupil.pixel_edges import edge_samples
 from dolens.rendering.pupil.pupil_boundary import pupil_boundary_map
 from dolens.scene.scene import Scene
 from dolens.scene.texture import texture_origin
+from dolens.seeded_generators import generator_of
 from dolens.sensor.pixels import Sensor
-
-_SEED_RANGE = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -238,7 +237,7 @@ class RayRenderer(Renderer):
         """The chunks that the backward pass traces again."""
         chunks = len(self._chunks)
         count = max(1, round(self.gradient_fraction * chunks))
-        generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
+        generator = generator_of(seed)
         return torch.randperm(chunks, generator=generator)[:count].tolist()
 
     def _fused(

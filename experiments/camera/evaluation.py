@@ -17,6 +17,7 @@ from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.reconstruction.processes import gathered
 from dolens.reconstruction.quality import SIMILARITY_WINDOW
+from dolens.seeded_generators import generator_of
 from dolens.sensor.colour import linear_to_srgb
 from dolens.stages import stage as named_stage
 
@@ -64,7 +65,7 @@ class Evaluation:
         index: int,
     ) -> None:
         for kind, calibration in self.miscalibrations.items():
-            generator = torch.Generator().manual_seed(seed_of(0, "test", index))
+            generator = generator_of(seed_of(0, "test", index))
             with named_stage(f"calibration {kind}"):
                 with camera.exact():
                     wrong = calibration.functions(

@@ -1,10 +1,10 @@
 """The base class of a camera's views: the images that are taken of a texture."""
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
-import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
@@ -14,6 +14,7 @@ from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.scene import Scene
+from dolens.seeded_generators import generator_of
 from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
@@ -62,6 +63,7 @@ class Imaging(ABC):
     Attributes:
         scene: what the camera looks at.
         renderer: of the training images; its sensor has the pixels of one image.
+        evaluation_renderer: of the validation and test images.
         readout: what the sensor makes of light.
         seed: of rendering and noise.
         keeps_pupil: whether the training renderer keeps the lens's pupil from one `prepare` to the
@@ -79,6 +81,7 @@ class Imaging(ABC):
         self.seed = seed
         # What makes the training images, with what it found of the lens.
         self._training = renderer
+        self.evaluation_renderer = renderer
 
     @property
     def sensor(self) -> Sensor:
@@ -165,6 +168,12 @@ class Imaging(ABC):
         """
         return None
 
+    def judged_by_training(self) -> Self:
+        """Return these views with the training's renderer for evaluation images too."""
+        found = copy.copy(self)
+        found.evaluation_renderer = self._training
+        return found
+
     def reference_renderers(self) -> Sequence[str]:
         """Names of renderers that make the test images besides."""
         return []
@@ -210,7 +219,7 @@ class Imaging(ABC):
 
     def _raw(self, image: Tensor, seed: int, share: BatchShare | None = None) -> Tensor:
         """An image in linear light, read out with the noise of a seed and developed."""
-        generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
+        generator = generator_of(seed + _NOISE_OFFSET, image.device)
         return self.readout.develop(self.readout(image, generator, share))
 
     def rays(self) -> int:

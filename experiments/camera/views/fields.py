@@ -40,6 +40,7 @@ from dolens.rendering.protocol import (
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.seeded_generators import generator_of
 from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.pixels import Sensor
@@ -194,7 +195,7 @@ class FieldViews(Imaging):
 
     def _shown(self, stage: str, number: int) -> list[Sensor]:
         """The windows of texture `number` of a stage."""
-        generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
+        generator = generator_of(seed_of(self.seed, stage, number))
         if stage == "train":
             return [self.windows.training(generator)]
         zones = [self.windows.zone(share, number) for share in self.zones.values()]

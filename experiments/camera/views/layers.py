@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -12,6 +11,7 @@ from dolens.experiments.camera.views.depths import DepthViews
 from dolens.experiments.data.occluders import with_occluders
 from dolens.optics.lens import Lens
 from dolens.scene.layered import LayeredScene
+from dolens.seeded_generators import generator_of
 from dolens.sensor.batch_share import BatchShare
 
 
@@ -48,8 +48,7 @@ class LayerViews(DepthViews):
     ) -> Views:
         """One image of each texture."""
         if textures.shape[1] == len(self.scene.wavelengths):
-            seed = seed_of(self.seed, stage, index) + SCENE_OFFSET
-            generator = torch.Generator().manual_seed(seed)
+            generator = generator_of(seed_of(self.seed, stage, index) + SCENE_OFFSET)
             near, far = self.scene.depths[0], self.scene.depths[-1]
             before = 0 if share is None else share.first
             textures = with_occluders(textures, near, far, self.occluders, generator, before)
