@@ -13,6 +13,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
+from dolens.optics.system import OpticalSystem
 from dolens.rendering.binning import bin_rays
 from dolens.rendering.sampling import regular_square, square_to_disc
 from dolens.scene.scene import Scene
@@ -29,6 +30,7 @@ def axial_point_spread_functions(
     size: int = 65,
     pupil_samples: int = 64,
     values: Mapping[str, Tensor] | None = None,
+    centred: bool = False,
 ) -> Tensor:
     """Point spread functions on the axis, at every depth and wavelength of a scene.
 
@@ -42,6 +44,8 @@ def axial_point_spread_functions(
         scene: depths and wavelengths.
         sensor: its pixel pitch.
         size: pixels along each side, odd; the axis falls on the central pixel.
+        centred: the chief ray of the lens's reference wavelength falls there instead, as in an
+            image that is registered by its chief rays: those of a tilted lens leave the axis.
         pupil_samples: strata along each side of the pupil.
         values: lens parameters to use instead of the stored ones.
 
@@ -75,9 +79,21 @@ def axial_point_spread_functions(
     if not bool((total > 0.0).all()):
         dark = scene.depths[int(torch.nonzero(total <= 0.0)[0, 0])]
         raise InputError(f"no light from the axis at {dark:g} mm reaches the sensor")
-    columns = size // 2 - there.x / sensor.pixel_pitch
-    rows = size // 2 + there.y / sensor.pixel_pitch
+    x, y = there.x, there.y
+    if centred:
+        chief = _chief_rays(lens, system, scene)
+        x, y = x - chief.x[:, None, None], y - chief.y[:, None, None]
+    columns = size // 2 - x / sensor.pixel_pitch
+    rows = size // 2 + y / sensor.pixel_pitch
     return splat(rows, columns, weight / total[..., None], size, cpu_kernels_serve(system))
+
+
+def _chief_rays(lens: Lens, system: OpticalSystem, scene: Scene) -> Components:
+    """Where the chief rays of the axial points land on the sensor, (depths,)."""
+    zero = torch.zeros(len(scene.depths), dtype=system.dtype, device=system.device)
+    start = zero - torch.tensor(scene.depths, dtype=system.dtype, device=system.device)
+    along = Components(zero, zero, start, zero, zero, zero + 1.0)
+    return trace_components(system, along, lens.primary_wavelength, 1.0)[0]
 
 
 def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int, fused: bool = False) -> Tensor:

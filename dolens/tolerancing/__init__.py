@@ -1,6 +1,8 @@
 """This package predicts what manufacturing does to a lens: sensitivities, tolerances, yield."""
 
 from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
+from dolens.tolerancing.assembly import FocusTarget, assembled, best_focus
+from dolens.tolerancing.desensitising import expected_spread
 from dolens.tolerancing.linear_spots import LinearSpots, linear_spots
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
 from dolens.tolerancing.perturbations import Tolerances, scaled_tolerances, tolerances_from
@@ -18,6 +20,7 @@ from dolens.tolerancing.yields import Yield, quantiles, share_within
 __all__ = [
     "Contributions",
     "FocusCurves",
+    "FocusTarget",
     "LinearSpots",
     "Outcome",
     "PerturbedSpots",
@@ -26,7 +29,10 @@ __all__ = [
     "Tolerances",
     "Yield",
     "analyse_tolerances",
+    "assembled",
+    "best_focus",
     "contributions",
+    "expected_spread",
     "fields_all_around",
     "linear_spots",
     "quantiles",

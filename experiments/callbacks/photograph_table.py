@@ -12,7 +12,8 @@ class PhotographTable(lightning.Callback):
     """Writes `test_photographs.csv`, a row of scores for each test photograph and view.
 
     Every judge has a table of its own besides, such as `test_wave_photographs.csv`.
-    `dolens compare` pairs runs by these tables.
+    `dolens compare` pairs runs by these tables.  A camera that is judged as built has
+    `made_lenses.csv`, a row for each lens.
 
     Args:
         folder: the run folder.
@@ -25,3 +26,6 @@ class PhotographTable(lightning.Callback):
         """Write the tables."""
         for stage, scores in getattr(pl_module, "test_scores", {}).items():
             write_table(self.folder / table_name(stage), scores.rows())
+        made = getattr(pl_module, "made_scores", None)
+        if made is not None:
+            write_table(self.folder / "made_lenses.csv", made.rows(), digits=7)

@@ -1,6 +1,7 @@
 """Training and evaluation of a camera."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import lightning
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.adversary import Adversary
+from dolens.experiments.camera.as_built import AsBuilt, Manufacture
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.calibration import check as check_miscalibrations
@@ -16,15 +18,22 @@ from dolens.experiments.camera.costs import StepCosts
 from dolens.experiments.camera.evaluation import Evaluation, check_size, means_of, without_loss
 from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
+from dolens.experiments.camera.made_images import images_of_made_lenses, restored_in_parts
+from dolens.experiments.camera.made_lens_scores import (
+    MadeLensScores,
+    made_lens_scores,
+    made_lenses_figure_of,
+)
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
 from dolens.experiments.camera.settings import Reconstruction, Training
-from dolens.experiments.camera.views.base import Imaging
+from dolens.experiments.camera.views.base import Imaging, Views
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
+from dolens.sensor.batch_share import BatchShare
 from dolens.stages import stage as named_stage
 
 # Beside the scores.
@@ -40,6 +49,9 @@ _METRICS = (
     "lens_step/*",
     "lens_steps/*",
     "auto/*",
+    "made/*",
+    "error/made/*",
+    "train/sensitivity",
     "network/pretrained",
     "loss/perceptual_available",
 )
@@ -67,6 +79,8 @@ class CameraModule(Camera):
             A step of the lens after which a chief ray does not reach the stop is taken back.
         miscalibrations: point spread functions that tests give the network besides; see
             `Evaluation`.
+        tolerances: of the lens that is made, see `tolerances_from`; None: the lens as drawn.
+        as_built: how lenses are made, and what is known of them.
 
     Raises:
         InputError: a setting is out of range, or the network or the loss does not fit.
@@ -82,6 +96,8 @@ class CameraModule(Camera):
         variables: Mapping[str, Mapping[str, Any] | None] | None,
         operands: Sequence[Mapping[str, Any]],
         miscalibrations: Mapping[str, Miscalibration] | None,
+        tolerances: Mapping[str, Any] | None = None,
+        as_built: AsBuilt | None = None,
     ) -> None:
         super().__init__(
             lens,
@@ -119,6 +135,13 @@ class CameraModule(Camera):
         )
         views.expose(self.lens)
         check_miscalibrations(self.evaluation.miscalibrations, lens)
+        self.manufacture = (
+            None
+            if tolerances is None
+            else Manufacture(as_built or AsBuilt(), tolerances, self.lens, views)
+        )
+        self.made_scores: MadeLensScores | None = None
+        self._made_crops: list[Tensor] = []
 
     def check_trainer(self, trainer: lightning.Trainer) -> None:
         """Refuse what the data or the discriminators cannot share; see `Experiment.check_trainer`.
@@ -131,6 +154,11 @@ class CameraModule(Camera):
             raise InputError(
                 f"trainer.accumulate_grad_batches: {batches}; allowed with a discriminator: 1, as "
                 "it makes a step for every batch"
+            )
+        if self.manufacture is not None and trainer.world_size > 1:
+            raise InputError(
+                f"trainer.devices: {trainer.world_size}; allowed with tolerances: 1, as one "
+                "process makes the lenses of a step"
             )
 
     # ---------------------------------------------------------------- training
@@ -201,13 +229,18 @@ class CameraModule(Camera):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         with self.costs.making_images():
             values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
-            taken, functions = self.take(values, batch, "train", self.global_step, share=share)
+            taken, functions = self._taken(values, batch, share)
         self.costs.watch_backward(taken.raw)
-        restored = self.restore(taken, functions)
+        restored = restored_in_parts(self, taken, functions)
         truth = taken.truth.to(restored.dtype)
         terms = self.loss_over_views(restored, truth, shared=True)
         with self.exact():
             penalty, operands = self.lens_steps.penalty(values)
+            if self.manufacture is not None:
+                sensitivity = self.manufacture.penalty(self.lens, values)
+                if sensitivity is not None:
+                    self.log("train/sensitivity", sensitivity.detach().float())
+                    penalty = penalty + sensitivity.to(penalty)
         total = terms["total"]
         if not self.lens_steps.apart:
             total = total + penalty.to(restored.dtype)
@@ -226,6 +259,22 @@ class CameraModule(Camera):
             self.log_dict({f"train/{name}": value for name, value in numbers.items()})
             total = total + term
         return total
+
+    def _taken(
+        self, values: Mapping[str, Tensor], batch: Tensor, share: BatchShare | None
+    ) -> tuple[Views, list[Tensor | None]]:
+        """Image a batch through the lens as drawn, or its parts through lenses that are made.
+
+        Returns:
+            The images, and what functions the network gets for each equal part of the batch.
+        """
+        made = self.manufacture
+        if made is None or not made.in_training:
+            taken, functions = self.take(values, batch, "train", self.global_step, share=share)
+            return taken, [functions]
+        with self.exact():
+            lenses = made.for_step(self.lens, values, self.global_step)
+            return images_of_made_lenses(self, made, lenses, values, batch, share)
 
     def optimizer_step(
         self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
@@ -266,6 +315,10 @@ class CameraModule(Camera):
     def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
         if index == 0:
             self._shown[stage] = batch[:1].clone()
+        if stage == "test" and self.manufacture is not None:
+            left = self.manufacture.settings.crops - sum(map(len, self._made_crops))
+            if left > 0:
+                self._made_crops.append(batch[:left].clone())
         self.evaluation.measure(self, batch, stage, self.evaluation_batch(stage, index))
 
     def on_validation_epoch_end(self) -> None:
@@ -273,8 +326,12 @@ class CameraModule(Camera):
         self._log_evaluations()
 
     def on_test_epoch_end(self) -> None:
-        """Log the means."""
+        """Log the means, and judge the camera by lenses that are made."""
         self._log_evaluations()
+        if self.manufacture is not None and self.manufacture.settings.tested:
+            crops, self._made_crops = torch.cat(self._made_crops), []
+            with named_stage("lenses as built"):
+                self.made_scores = made_lens_scores(self, self.manufacture, crops)
 
     def _log_evaluations(self) -> None:
         found = self.evaluation.scores(self.trainer, self.views.labels())
@@ -296,6 +353,8 @@ class CameraModule(Camera):
             numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers() | self.evaluation.costs()
+        if self.made_scores is not None:
+            numbers |= self.made_scores.numbers()
         return numbers | self.lens_steps.numbers() | self.costs.numbers()
 
     def metric_names(self) -> list[str]:
@@ -304,7 +363,10 @@ class CameraModule(Camera):
 
     def figures(self) -> Figures:
         """Return the first test crop, point spread functions, and the layout."""
-        return camera_figures(self, self._shown, "test", self.test_scores.get("test"))
+        found = camera_figures(self, self._shown, "test", self.test_scores.get("test"))
+        if self.made_scores is None:
+            return found
+        return {**found, "made_lenses": partial(made_lenses_figure_of, self.made_scores)}
 
     def training_figures(self) -> Figures:
         """Return those of the lens; `ValidationPictures` has the images."""

@@ -180,7 +180,14 @@ class DepthViews(Imaging):
         samples = pupil_samples or self.psf_pupil_samples
         scene = self._psf_scene(depths)
         functions = axial_point_spread_functions(
-            lens, scene, self.sensor, size or self.psf_size, samples, values
+            lens,
+            scene,
+            self.sensor,
+            size or self.psf_size,
+            samples,
+            values,
+            # Where image and truth move together with the chief rays, so do the functions.
+            centred=self.truth == "chief_rays",
         )
         if self.psf_diffraction == "none":
             return functions

@@ -1,0 +1,178 @@
+"""Cameras as built: each lens is off by its tolerances, and focused by an assembly line."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError, check_choice
+from dolens.experiments.camera.views.base import Imaging, seed_of
+from dolens.experiments.checks import check_count, check_positive
+from dolens.optics.lens import Lens
+from dolens.seeded_generators import generator_of
+from dolens.sensor.psf_noise import noisy_point_spread_functions
+from dolens.tolerancing import (
+    FocusTarget,
+    Tolerances,
+    assembled,
+    expected_spread,
+    tolerances_from,
+)
+
+# What a network knows of the lens whose images it restores.
+CALIBRATIONS = ("design", "own", "measured")
+# A stream of random numbers apart from those of images, noise and scenes.
+_OFFSET = 1 << 37
+# Lenses of a test do not meet those of a training.
+_TESTED = 1 << 35
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """Settings of lenses that are made with errors; they count where tolerances are given.
+
+    Attributes:
+        factor: multiplies all tolerances.
+        train: whether training images are taken through lenses that are made anew at each step;
+            else the lens is trained as drawn, and judged as built.
+        lenses_per_step: made for each step; they share its textures.
+        focused: whether an assembly line sets each sensor, by a point on the axis.
+        calibration: which point spread functions the network is given: `design`, those of the
+            lens as drawn, the same for all; `own`, those of each lens; `measured`, the same with
+            the noise of a measurement.
+        electrons: that a measured function has in all.
+        read_noise: electrons a pixel, of a measured function.
+        desensitising: weight of the mean square by which errors move rays within their spots, in
+            pixels², beside the loss; 0: none.
+        tested: lenses that the camera is judged by, behind its test; 0: none.
+        crops: test crops that each of them images.
+        loss_db: a lens passes whose worst view loses no more than this to the lens as drawn.
+
+    Raises:
+        InputError: a number out of range, or an unknown word.
+    """
+
+    factor: float = 1.0
+    train: bool = True
+    lenses_per_step: int = 1
+    focused: bool = True
+    calibration: str = "design"
+    electrons: float = 1.0e5
+    read_noise: float = 3.0
+    desensitising: float = 0.0
+    tested: int = 500
+    crops: int = 4
+    loss_db: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_choice(self.calibration, CALIBRATIONS, "as_built.calibration")
+        for name in ("factor", "electrons", "loss_db"):
+            check_positive(f"as_built.{name}", getattr(self, name))
+        for name in ("lenses_per_step", "crops"):
+            check_count(f"as_built.{name}", getattr(self, name))
+        for name in ("tested", "read_noise", "desensitising"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"as_built.{name}: {getattr(self, name)}; allowed: 0 or more")
+
+
+class MadeLens(NamedTuple):
+    """One lens that was made.
+
+    Attributes:
+        values: its parameters, as `Lens.system` takes them.
+        errors: (P,), of the tolerances' parameters, in the lens's units.
+        number: of the lens; it decides the noise of its calibration.
+    """
+
+    values: dict[str, Tensor]
+    errors: Tensor
+    number: int
+
+
+class Manufacture:
+    """Makes lenses of a design.
+
+    Args:
+        settings: how.
+        given: tolerances, see `tolerances_from`.
+        lens: as training begins; the assembly line's light goes through its pupil.
+        views: image the scene.
+
+    Attributes:
+        tolerances: of the lens as training begins: relative ones stay shares of those values.
+
+    Raises:
+        InputError: tolerances that are not of the lens.
+    """
+
+    def __init__(
+        self, settings: AsBuilt, given: Mapping[str, Any], lens: Lens, views: Imaging
+    ) -> None:
+        self.settings = settings
+        self.tolerances: Tolerances = tolerances_from(lens, given, settings.factor)
+        if not self.tolerances.names:
+            raise InputError("tolerances: none is given; allowed: null, or one parameter or more")
+        self._views = views
+        self._pitch = views.sensor.pixel_pitch
+        waves = tuple(views.scene.wavelengths)
+        self._target = (
+            FocusTarget.of(lens, views.object_distance, waves) if settings.focused else None
+        )
+        self._spots = views.spots(lens, 3, 6) if settings.desensitising else []
+
+    @property
+    def in_training(self) -> bool:
+        """Return whether training images are taken through lenses that are made."""
+        return self.settings.train
+
+    def for_step(self, lens: Lens, values: Mapping[str, Tensor], step: int) -> list[MadeLens]:
+        """Return the lenses of a training step, differentiable in the design."""
+        return self._made(lens, values, self.settings.lenses_per_step, step)
+
+    def tested(self, lens: Lens, values: Mapping[str, Tensor], number: int) -> MadeLens:
+        """Return one of the lenses that judge a camera; the same of every camera."""
+        return self._made(lens, values, 1, _TESTED + number)[0]
+
+    def _made(
+        self, lens: Lens, values: Mapping[str, Tensor], count: int, number: int
+    ) -> list[MadeLens]:
+        # Lenses of a test must be the same whatever the seed of a training is.
+        seed = 0 if number >= _TESTED else self._views.seed
+        generator = generator_of(seed_of(seed, "train", _OFFSET + number))
+        return [
+            MadeLens(assembled(lens, values, self.tolerances, errors, self._target), errors, number)
+            for errors in self.tolerances.draw(count, generator)
+        ]
+
+    def functions(self, lens: Lens, design: Mapping[str, Tensor], made: MadeLens) -> Tensor:
+        """Return the point spread functions (views, 3, K, K) that a network is given.
+
+        Args:
+            lens: as drawn, with the parameters of the design.
+            design: its variables.
+            made: the lens whose images it restores.
+        """
+        if self.settings.calibration == "design":
+            return self._views.point_spread_functions(lens, design)
+        own = self._views.point_spread_functions(lens, made.values)
+        if self.settings.calibration == "own":
+            return own
+        generator = generator_of(_OFFSET + made.number)
+        measured = noisy_point_spread_functions(
+            own, self.settings.electrons, self.settings.read_noise, generator
+        )
+        # The noise is held in the derivative as it is in the value.
+        return own + (measured - own).detach()
+
+    def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor | None:
+        """Return what sensitivity adds to the loss; None where it has no weight."""
+        if not self._spots:
+            return None
+        spreads = [
+            expected_spread(lens, values, self.tolerances, spots, self._target)
+            for spots in self._spots
+        ]
+        mean = torch.stack(spreads).mean() / self._pitch**2
+        return self.settings.desensitising * mean

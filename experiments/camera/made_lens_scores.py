@@ -1,0 +1,163 @@
+"""A camera is judged by many lenses of its series: what their worst tenth gives, and the yield."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.experiments.camera.as_built import Manufacture
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.tables import Row
+from dolens.plotting.made_lenses import made_lenses_figure
+from dolens.reconstruction import psnr_db
+from dolens.tolerancing import Tolerances
+
+# The worst tenth of the lenses begins at this share, from the worst.
+_DECILE = 0.1
+_SEED, _RESAMPLES, _LEVEL = 0, 2000, 0.95
+
+
+@dataclass(frozen=True)
+class MadeLensScores:
+    """Scores of N lenses that were made, on the same crops with the same noise.
+
+    Attributes:
+        views: labels of the V views.
+        psnr_db: (N, V), means over crops.
+        as_drawn: (V,), of the lens without errors.
+        errors: (N, P), of the parameters, in the lens's units.
+        tolerances: of these parameters.
+        loss_db: a lens passes that loses no more than this to the lens as drawn, each by its worst
+            view.
+        seconds: that one lens takes.
+    """
+
+    views: tuple[str, ...]
+    psnr_db: Tensor
+    as_drawn: Tensor
+    errors: Tensor
+    tolerances: Tolerances
+    loss_db: float
+    seconds: float
+
+    @property
+    def worst_view(self) -> Tensor:
+        """Return the PSNR of the worst view of each lens, (N,), dB."""
+        return self.psnr_db.amin(1)
+
+    @property
+    def passing(self) -> float:
+        """Return the least PSNR, dB, of the worst view of a lens that passes."""
+        return float(self.as_drawn.amin()) - self.loss_db
+
+    def numbers(self) -> dict[str, float]:
+        """Return metrics, with intervals of 95 % over the lenses."""
+        worst = self.worst_view
+        found = {
+            "made/lenses": float(len(worst)),
+            "made/psnr_db/as_drawn": float(self.as_drawn.amin()),
+            "made/psnr_db/mean": float(worst.mean()),
+            "made/psnr_db/median": float(worst.median()),
+            "made/psnr_db/worst_decile": float(_worst_decile(worst)),
+            "made/yield": float((worst >= self.passing).double().mean()),
+            "cost/made_lens_s": self.seconds,
+        }
+        if len(worst) > 1:
+            generator = torch.Generator().manual_seed(_SEED)
+            rows = torch.randint(len(worst), (_RESAMPLES, len(worst)), generator=generator)
+            drawn = _worst_decile(worst[rows])
+            ends = torch.tensor([0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL], dtype=drawn.dtype)
+            for end, value in zip(("low", "high"), drawn.quantile(ends).tolist(), strict=True):
+                found[f"error/made/psnr_db/worst_decile/{end}"] = value
+        return found
+
+    def rows(self) -> list[Row]:
+        """Return a row for each lens: its scores, and its errors in the units of files."""
+        shares = self.errors / self.tolerances.unit
+        percent = [unit == "%" for unit in self.tolerances.unit_names]
+        shares = shares * torch.where(torch.tensor(percent), 100.0, 1.0)
+        labels = [
+            f"{name} ({unit})" if unit else name
+            for name, unit in zip(self.tolerances.names, self.tolerances.unit_names, strict=True)
+        ]
+        return [
+            {
+                "lens": str(number),
+                "psnr_db/worst": float(scores.amin()),
+                **{f"psnr_db/{v}": float(s) for v, s in zip(self.views, scores, strict=True)},
+                **dict(zip(labels, off.tolist(), strict=True)),
+            }
+            for number, (scores, off) in enumerate(zip(self.psnr_db, shares, strict=True))
+        ]
+
+
+def _worst_decile(worst: Tensor) -> Tensor:
+    """Return the mean of the lowest tenth of scores (..., N), of one of them at least."""
+    count = max(1, math.ceil(_DECILE * worst.shape[-1] - 1e-9))
+    return worst.sort(-1).values[..., :count].mean(-1)
+
+
+@torch.no_grad()
+def made_lens_scores(camera: Camera, manufacture: Manufacture, crops: Tensor) -> MadeLensScores:
+    """Image crops through lenses that are made, restore them, and compare them with the truth.
+
+    The training's renderer makes the images: hundreds of lenses by rays would take hours.  All
+    lenses see the same crops with the same noise.
+
+    Args:
+        camera: as trained.
+        manufacture: makes the lenses.
+        crops: textures (B, 3, h, w), linear light.
+    """
+    judging = camera.views.judged_by_training()
+    design = camera.variables()
+    started = time.perf_counter()
+
+    def scores(values: dict[str, Tensor], functions: Tensor | None) -> Tensor:
+        with camera.exact():
+            taken = judging.take(camera.lens, values, crops, "test", 0)
+        restored = camera.restore(taken, functions).clamp(0.0, 1.0)
+        truth = taken.truth.to(restored.dtype)
+        found = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1))
+        return found.unflatten(0, truth.shape[:2]).mean(0).double().cpu()
+
+    with evaluating(camera.network):
+        as_drawn = scores(dict(design), camera.functions(design))
+        rows, errors = [], []
+        for number in range(manufacture.settings.tested):
+            with camera.exact():
+                made = manufacture.tested(camera.lens, design, number)
+                functions = (
+                    manufacture.functions(camera.lens, design, made)
+                    if camera.network.needs_point_spread_function
+                    else None
+                )
+            rows.append(scores(made.values, functions))
+            errors.append(made.errors)
+    seconds = (time.perf_counter() - started) / (len(rows) + 1)
+    return MadeLensScores(
+        tuple(judging.labels()),
+        torch.stack(rows),
+        as_drawn,
+        torch.stack(errors),
+        manufacture.tolerances,
+        manufacture.settings.loss_db,
+        seconds,
+    )
+
+
+def made_lenses_figure_of(scores: MadeLensScores) -> Figure:
+    """Draw how many of the lenses reach which PSNR."""
+    name = f"{len(scores.psnr_db)} lenses as built"
+    numbers = scores.numbers()
+    title = (
+        f"worst decile {numbers['made/psnr_db/worst_decile']:.2f} dB, "
+        f"{100.0 * numbers['made/yield']:.0f} % pass"
+    )
+    return made_lenses_figure(
+        {name: scores.worst_view}, {name: float(scores.as_drawn.amin())}, scores.passing, title
+    )

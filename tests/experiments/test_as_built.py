@@ -1,0 +1,227 @@
+"""Cameras are trained and judged through lenses as they are built."""
+
+import csv
+import json
+
+import pytest
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from tiny_experiment import TINY, TINY_NETWORK
+
+from dolens import InputError
+from dolens.experiments.camera.made_images import images_of_made_lenses
+from dolens.experiments.camera.made_lens_scores import MadeLensScores
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens, run
+from dolens.rendering.psf import axial_point_spread_functions
+
+AS_BUILT = [
+    "experiment=wavefront_coding_as_built",
+    *TINY,
+    *TINY_NETWORK,
+    "trainer.max_epochs=1",
+    "as_built.tested=5",
+]
+
+
+@pytest.fixture
+def camera(composed):
+    def build(*overrides):
+        cfg = composed(*AS_BUILT, "lens_dtype=float64", *overrides)
+        return instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+
+    return build
+
+
+def textures(count=2, side=24 + 32):
+    return torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(5))
+
+
+def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
+    run(composed(*AS_BUILT))
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    with (tmp_path / "run/made_lenses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    worst = sorted(float(row["psnr_db/worst"]) for row in rows)
+    assert len(rows) == metrics["made/lenses"] == 5
+    # The worst tenth of five lenses is one of them.
+    assert metrics["made/psnr_db/worst_decile"] == pytest.approx(worst[0], rel=1e-6)
+    assert metrics["made/psnr_db/mean"] == pytest.approx(sum(worst) / 5, rel=1e-6)
+    passing = metrics["made/psnr_db/as_drawn"] - 1.0
+    assert metrics["made/yield"] == sum(score >= passing for score in worst) / 5
+    low, high = (metrics[f"error/made/psnr_db/worst_decile/{end}"] for end in ("low", "high"))
+    assert low <= metrics["made/psnr_db/worst_decile"] <= high
+    assert max(abs(float(row["elements.plate.tilt_x (deg)"])) for row in rows) <= 0.2
+    assert max(abs(float(row["surfaces.2.curvature (%)"])) for row in rows) <= 1.0
+    assert (tmp_path / "run/figures/made_lenses.png").stat().st_size > 5000
+    assert metrics["train/loss"] > 0.0
+
+
+def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
+    module = camera("as_built.factor=1e-9", "as_built.lenses_per_step=2")
+    design, batch = module.variables(), textures()
+    drawn, functions = module.take(design, batch, "train", 0)
+    made = module.manufacture.for_step(module.lens, design, 0)
+    assert len(made) == 2
+    taken, own = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
+    # The sensor's noise too is that of the whole batch.
+    torch.testing.assert_close(taken.raw, drawn.raw, rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(taken.truth, drawn.truth, rtol=0.0, atol=1e-4)
+    for part in own:
+        torch.testing.assert_close(part, functions, rtol=0.0, atol=1e-6)
+
+
+def test_each_lens_has_its_part_of_the_batch(camera):
+    module = camera("as_built.lenses_per_step=2", "as_built.calibration=own")
+    design, batch = module.variables(), textures()
+    made = module.manufacture.for_step(module.lens, design, 3)
+    taken, own = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
+    for number, lens in enumerate(made):
+        functions = module.views.point_spread_functions(module.lens, lens.values)
+        torch.testing.assert_close(own[number], functions)
+    assert (own[0] - own[1]).abs().max() > 1e-4
+    assert taken.raw.shape[0] == 2
+
+
+def test_judging_lenses_are_those_of_every_seed_and_no_training_s(camera):
+    one, other = camera(), camera("seed=7")
+    first, again = (m.manufacture.tested(m.lens, m.variables(), 4) for m in (one, other))
+    assert torch.equal(first.errors, again.errors)
+    trained = [m.manufacture.for_step(m.lens, m.variables(), 4)[0] for m in (one, other)]
+    assert not torch.equal(trained[0].errors, trained[1].errors)
+    assert not torch.equal(first.errors, trained[0].errors)
+
+
+def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
+    # A decentred stop cuts the sampled disc: only many samples see it move evenly.
+    module = camera(
+        "renderer=psf",
+        "renderer.fields=[1,1]",
+        "renderer.size=33",
+        "renderer.jitter=false",
+        "renderer.pupil_samples=160",
+        "as_built.calibration=own",
+        "readout=ideal",
+    )
+    batch = textures(1).double()
+    weight = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(1)).double()
+    manufacture, scaled = module.manufacture, module.variables.scaled
+
+    def loss(at):
+        scaled.data.copy_(at)
+        values = module.variables()
+        made = manufacture.for_step(module.lens, values, 2)
+        taken, own = images_of_made_lenses(module, manufacture, made, values, batch, None)
+        return (taken.raw.double() * weight).sum() + 100.0 * own[0].double().square().sum()
+
+    start, step = scaled.detach().clone(), 0.1
+    (gradient,) = torch.autograd.grad(loss(start), scaled)
+    with torch.no_grad():
+        differences = torch.stack(
+            [
+                (loss(start + shift) - loss(start - shift)) / (2 * step)
+                for shift in step * torch.eye(len(start), dtype=start.dtype)
+            ]
+        )
+    assert (gradient - differences).norm() < 0.05 * gradient.norm()
+
+
+def test_measured_functions_keep_their_light_and_the_derivative_of_the_exact_ones(camera):
+    module = camera("as_built.calibration=measured", "as_built.electrons=1000")
+    design = module.variables()
+    made = module.manufacture.tested(module.lens, design, 0)
+    measured = module.manufacture.functions(module.lens, design, made)
+    exact = module.views.point_spread_functions(module.lens, made.values)
+    assert (measured - exact).abs().max() > 1e-3
+    torch.testing.assert_close(measured.sum((-2, -1)), exact.sum((-2, -1)), rtol=1e-5, atol=1e-6)
+    weight = torch.rand(exact.shape[-2:], generator=torch.Generator().manual_seed(0)).to(exact)
+    slopes = [
+        torch.autograd.grad((found * weight).sum(), module.variables.scaled, retain_graph=True)[0]
+        for found in (measured, exact)
+    ]
+    torch.testing.assert_close(*slopes)
+    again = module.manufacture.functions(module.lens, design, made)
+    assert torch.equal(measured, again)
+
+
+def test_the_image_of_a_shifted_lens_is_registered_by_its_chief_ray(camera):
+    module = camera()
+    values = {
+        "elements.doublet.decenter_x": torch.tensor(0.05, dtype=torch.float64),
+        "surfaces.5.x3": torch.zeros((), dtype=torch.float64),
+        "surfaces.5.y3": torch.zeros((), dtype=torch.float64),
+    }
+    views, lens = module.views, module.lens
+    centred = views.point_spread_functions(lens, values, size=65)
+    apart = axial_point_spread_functions(lens, views.scene, views.sensor, 65, 8, values)
+    column = torch.arange(65, dtype=centred.dtype) - 32
+
+    def mean(functions):
+        return (functions.sum(-2) * column).sum(-1) / functions.sum((-2, -1))
+
+    # A lens that is 0.05 mm aside moves the image by as much, seven pixels of 6.9 µm.
+    moved = (mean(apart) - mean(centred)).abs()
+    torch.testing.assert_close(moved, torch.full_like(moved, 0.05 / 0.0069), rtol=0.05, atol=0.0)
+    assert mean(centred).abs().max() < 0.5
+    # A lens without errors has its chief ray on the axis.
+    same = axial_point_spread_functions(lens, views.scene, views.sensor, 33, 8)
+    assert torch.equal(views.point_spread_functions(lens, {}), same)
+
+
+def test_sensitivity_counts_in_the_loss_by_its_weight(camera):
+    module = camera("as_built.desensitising=0.5")
+    twice = camera("as_built.desensitising=1.0")
+    small = camera("as_built.desensitising=1.0", "as_built.factor=0.1")
+    found = [m.manufacture.penalty(m.lens, m.variables()) for m in (module, twice, small)]
+    torch.testing.assert_close(2.0 * found[0], found[1])
+    torch.testing.assert_close(found[1], 100.0 * found[2], rtol=1e-6, atol=0.0)
+    (slope,) = torch.autograd.grad(found[1], twice.variables.scaled)
+    assert slope.abs().max() > 0.0
+    assert camera().manufacture.penalty(module.lens, module.variables()) is None
+
+
+def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
+    module = camera()
+    worst = torch.arange(1.0, 31.0, dtype=torch.float64)
+    scores = MadeLensScores(
+        ("a", "b"),
+        torch.stack([worst, worst + 5.0], 1),
+        torch.tensor([20.0, 30.0]),
+        torch.zeros(30, len(module.manufacture.tolerances.names)),
+        module.manufacture.tolerances,
+        2.0,
+        0.1,
+    )
+    numbers = scores.numbers()
+    assert numbers["made/psnr_db/worst_decile"] == 2.0
+    assert numbers["made/yield"] == pytest.approx(13 / 30)
+    assert numbers["made/psnr_db/as_drawn"] == 20.0
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("as_built.calibration=exact", "as_built.calibration"),
+        ("as_built.lenses_per_step=0", "as_built.lenses_per_step"),
+        ("as_built.electrons=-1", "as_built.electrons"),
+        ("as_built.tested=-1", "as_built.tested"),
+        ("+tolerances={surfaces.9.curvature: 0.1}", "surfaces.9.curvature"),
+    ],
+)
+def test_what_is_wrong_is_said_before_a_step(composed, override, words):
+    with pytest.raises((InputError, InstantiationException), match=words):
+        run(composed(*AS_BUILT, override))
+
+
+def test_no_tolerances_are_not_the_lens_as_drawn(composed):
+    with pytest.raises((InputError, InstantiationException), match="tolerances: none is given"):
+        run(composed("experiment=wavefront_coding", *TINY, *TINY_NETWORK, "tolerances={}"))
+
+
+def test_a_batch_that_lenses_cannot_share_equally_is_refused(camera):
+    module = camera("as_built.lenses_per_step=2")
+    design = module.variables()
+    made = module.manufacture.for_step(module.lens, design, 0)
+    with pytest.raises(InputError, match="lenses_per_step"):
+        images_of_made_lenses(module, module.manufacture, made, design, textures(3), None)

@@ -1,0 +1,138 @@
+"""A lens that is made with errors is focused as an assembly line does it."""
+
+import pytest
+import torch
+
+from dolens import InputError
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
+from dolens.optics.ray_tracing import trace_components
+from dolens.optics.rays import Components
+from dolens.tolerancing import (
+    FocusTarget,
+    assembled,
+    best_focus,
+    expected_spread,
+    tolerances_from,
+)
+
+LINES = (656.2725, 587.5618, 486.1327)
+
+
+@pytest.fixture
+def target(triplet):
+    return FocusTarget.of(triplet, None, LINES)
+
+
+def axial_rms(lens, values, spots):
+    """The RMS radius of the light of all wavelengths together, mm."""
+    ray = Components(*(c.detach() for c in spots.rays.components()))
+    at, _ = trace_components(lens.system(values), ray, spots.rays.wavelength, 1.0)
+    weight = spots.weight / spots.count
+    points = torch.stack([at.x, at.y])
+    return (weight * (points - (weight * points).sum(-1, keepdim=True)).square()).sum().sqrt()
+
+
+def test_the_best_focus_has_the_least_spot_of_all_sensor_positions(triplet, target):
+    spots = gaussian_quadrature(triplet, [(0.0, 0.0)], LINES, 4, 8, symmetry=False)
+    values = {"elements.rear.tilt_y": torch.tensor(0.004, dtype=torch.float64)}
+    shift = best_focus(triplet.system(values), target)
+    distance = triplet.sensor_distance.detach() + shift
+
+    def rms(offset):
+        moved = values | {"sensor_distance": distance.detach() + offset}
+        return float(axial_rms(triplet, moved, spots).detach())
+
+    assert rms(0.0) < rms(1e-3) and rms(0.0) < rms(-1e-3)
+    # Symmetric about the focus, since spots grow as the square of defocus.
+    assert rms(1e-3) == pytest.approx(rms(-1e-3), rel=1e-9)
+
+
+def test_a_made_lens_is_as_far_from_its_best_focus_as_the_design(triplet, target):
+    tolerances = tolerances_from(triplet, {"surfaces.*.curvature": 1e-4, "thicknesses.2": 0.05})
+    design = {"sensor_distance": triplet.sensor_distance.detach() + 0.3}
+    (errors,) = tolerances.draw(1, torch.Generator().manual_seed(1))
+    made = assembled(triplet, design, tolerances, errors, target)
+    of_design = best_focus(triplet.system(design), target)
+    of_made = best_focus(triplet.system(made), target)
+    assert float(of_design) == pytest.approx(-0.3, abs=0.1)
+    torch.testing.assert_close(of_made, of_design, rtol=1e-9, atol=1e-10)
+    # Without an assembly line the sensor stays where it is.
+    unfocused = assembled(triplet, design, tolerances, errors, None)
+    assert unfocused["sensor_distance"] is design["sensor_distance"]
+    assert abs(float(best_focus(triplet.system(unfocused), target) - of_design)) > 0.01
+
+
+def test_an_error_of_the_sensor_is_what_focusing_leaves_over(triplet, target):
+    tolerances = tolerances_from(triplet, {"surfaces.1.curvature": 1e-4, "sensor_distance": 0.05})
+    drawn = {"surfaces.1.curvature": 8e-5, "sensor_distance": 0.03}
+    errors = torch.tensor([drawn[name] for name in tolerances.names], dtype=torch.float64)
+    made = assembled(triplet, {}, tolerances, errors, target)
+    with_both = best_focus(triplet.system(made), target)
+    nominal = best_focus(triplet.system(), target)
+    torch.testing.assert_close(with_both, nominal - 0.03, rtol=0.0, atol=1e-9)
+
+
+def test_the_parameters_of_a_made_lens_are_differentiable_in_the_design(triplet, target):
+    tolerances = tolerances_from(triplet, {"surfaces.*.curvature": 1e-4, "thicknesses.4": 0.05})
+    (errors,) = tolerances.draw(1, torch.Generator().manual_seed(3))
+
+    def sensor(curvature):
+        values = {"surfaces.3.curvature": curvature}
+        return assembled(triplet, values, tolerances, errors, target)["sensor_distance"]
+
+    at = triplet.surfaces["3"].curvature.detach().clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(sensor(at), at)
+    step = 1e-6
+    difference = (sensor(at.detach() + step) - sensor(at.detach() - step)) / (2 * step)
+    torch.testing.assert_close(slope, difference, rtol=1e-6, atol=1e-9)
+    assert float(slope) != 0.0
+
+
+def test_the_expected_spread_is_what_drawn_lenses_show(triplet, target):
+    spots = gaussian_quadrature(triplet, [(0.0, 0.0), (0.0, 14.0)], LINES[:1], 3, 6, symmetry=False)
+    given = {"elements.*.tilt_[xy]": 0.02, "surfaces.*.curvature": 2e-5, "thicknesses.2": 0.01}
+    tolerances = tolerances_from(triplet, given)
+    expected = expected_spread(triplet, {}, tolerances, spots, target)
+    ray = Components(*spots.rays.components())
+
+    def centred(values):
+        at, _ = trace_components(triplet.system(values), ray, spots.rays.wavelength, 1.0)
+        points = torch.stack([at.x, at.y], -1).detach()
+        rows = spots.weight[:, None] * points
+        means = points.new_zeros(spots.count, 2).index_add(0, spots.spot, rows)
+        return points - means[spots.spot]
+
+    nominal = centred(None)
+    errors = tolerances.draw(1500, torch.Generator().manual_seed(0))
+    moved = [
+        (
+            spots.weight[:, None]
+            * (centred(assembled(triplet, {}, tolerances, row, target)) - nominal).square()
+        ).sum()
+        / spots.count
+        for row in errors
+    ]
+    # 1500 lenses tell a mean of squares of a dozen errors to a few per cent.
+    assert float(torch.stack(moved).mean()) == pytest.approx(float(expected), rel=0.06)
+
+
+def test_the_expected_spread_is_differentiable_in_the_design(triplet, target):
+    spots = gaussian_quadrature(triplet, [(0.0, 0.0), (0.0, 14.0)], LINES[:1], 3, 6, symmetry=False)
+    tolerances = tolerances_from(triplet, {"elements.*.tilt_x": 0.05, "thicknesses.2": 0.02})
+
+    def spread(curvature):
+        return expected_spread(
+            triplet, {"surfaces.3.curvature": curvature}, tolerances, spots, target
+        )
+
+    at = triplet.surfaces["3"].curvature.detach().clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(spread(at), at)
+    step = 1e-6
+    difference = (spread(at.detach() + step) - spread(at.detach() - step)) / (2 * step)
+    torch.testing.assert_close(slope, difference, rtol=1e-5, atol=0.0)
+
+
+def test_a_line_without_light_cannot_focus(triplet, target):
+    shut = {"surfaces.4.semi_diameter": torch.tensor(1e-6, dtype=torch.float64)}
+    with pytest.raises(InputError, match="no light"):
+        best_focus(triplet.system(shut), target)
