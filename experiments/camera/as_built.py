@@ -114,6 +114,7 @@ class Manufacture:
         self.tolerances: Tolerances = tolerances_from(lens, given, settings.factor)
         if not self.tolerances.names:
             raise InputError("tolerances: none is given; allowed: null, or one parameter or more")
+        views.check_made()
         self._views = views
         self._pitch = views.sensor.pixel_pitch
         waves = tuple(views.scene.wavelengths)

@@ -15,7 +15,13 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.calibration import check as check_miscalibrations
 from dolens.experiments.camera.costs import StepCosts
-from dolens.experiments.camera.evaluation import Evaluation, check_size, means_of, without_loss
+from dolens.experiments.camera.evaluation import (
+    Evaluation,
+    check_size,
+    means_of,
+    photographs_of_crops,
+    without_loss,
+)
 from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.made_images import images_of_made_lenses, restored_in_parts
@@ -23,6 +29,7 @@ from dolens.experiments.camera.made_lens_scores import (
     MadeLensScores,
     made_lens_scores,
     made_lenses_figure_of,
+    spread_over_photographs,
 )
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
@@ -316,9 +323,7 @@ class CameraModule(Camera):
         if index == 0:
             self._shown[stage] = batch[:1].clone()
         if stage == "test" and self.manufacture is not None:
-            left = self.manufacture.settings.crops - sum(map(len, self._made_crops))
-            if left > 0:
-                self._made_crops.append(batch[:left].clone())
+            self._made_crops.append(batch.clone())
         self.evaluation.measure(self, batch, stage, self.evaluation_batch(stage, index))
 
     def on_validation_epoch_end(self) -> None:
@@ -330,6 +335,8 @@ class CameraModule(Camera):
         self._log_evaluations()
         if self.manufacture is not None and self.manufacture.settings.tested:
             crops, self._made_crops = torch.cat(self._made_crops), []
+            of = photographs_of_crops(self.trainer, "test", len(crops))
+            crops = crops[spread_over_photographs(of, self.manufacture.settings.crops)]
             with named_stage("lenses as built"):
                 self.made_scores = made_lens_scores(self, self.manufacture, crops)
 

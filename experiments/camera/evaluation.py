@@ -96,7 +96,7 @@ class Evaluation:
                 name: torch.cat([values[number] for number in sorted(values)]).float()
                 for name, values in columns.items()
             }
-            of_crops = _photographs(trainer, stage.partition("_")[0], len(crops["psnr_db"]))
+            of_crops = photographs_of_crops(trainer, stage.partition("_")[0], len(crops["psnr_db"]))
             found[stage] = scores_by_photograph(crops, of_crops, labels)
         return found
 
@@ -165,7 +165,7 @@ def check_size(height: int, width: int) -> None:
         )
 
 
-def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
+def photographs_of_crops(trainer: object, stage: str, count: int) -> Sequence[str]:
     """Return the photograph of each crop; where the data know none, each crop counts as one."""
     data = getattr(trainer, "datamodule", None)
     if not hasattr(data, "evaluation_photographs"):

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -93,6 +94,21 @@ class MadeLensScores:
             }
             for number, (scores, off) in enumerate(zip(self.psnr_db, shares, strict=True))
         ]
+
+
+def spread_over_photographs(photographs: Sequence[str], count: int) -> list[int]:
+    """Return the numbers of so many crops, of as many photographs as there are.
+
+    Args:
+        photographs: the photograph of each crop.
+        count: crops at most.
+    """
+    turns: dict[str, int] = {}
+    ranked = []
+    for number, photograph in enumerate(photographs):
+        turns[photograph] = turns.get(photograph, -1) + 1
+        ranked.append((turns[photograph], number))
+    return sorted(number for _, number in sorted(ranked)[:count])
 
 
 def _worst_decile(worst: Tensor) -> Tensor:

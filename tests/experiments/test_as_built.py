@@ -11,7 +11,7 @@ from tiny_experiment import TINY, TINY_NETWORK
 
 from dolens import InputError
 from dolens.experiments.camera.made_images import images_of_made_lenses
-from dolens.experiments.camera.made_lens_scores import MadeLensScores
+from dolens.experiments.camera.made_lens_scores import MadeLensScores, spread_over_photographs
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
 from dolens.rendering.psf import axial_point_spread_functions
@@ -56,6 +56,12 @@ def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
     assert max(abs(float(row["surfaces.2.curvature (%)"])) for row in rows) <= 1.0
     assert (tmp_path / "run/figures/made_lenses.png").stat().st_size > 5000
     assert metrics["train/loss"] > 0.0
+
+
+def test_crops_are_of_as_many_photographs_as_there_are():
+    photographs = ["cat", "cat", "cat", "rocket", "coffee", "coffee"]
+    assert spread_over_photographs(photographs, 4) == [0, 1, 3, 4]
+    assert spread_over_photographs(photographs, 9) == [0, 1, 2, 3, 4, 5]
 
 
 def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
@@ -212,6 +218,11 @@ def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
 def test_what_is_wrong_is_said_before_a_step(composed, override, words):
     with pytest.raises((InputError, InstantiationException), match=words):
         run(composed(*AS_BUILT, override))
+
+
+def test_a_renderer_that_is_planned_for_the_lens_as_drawn_is_refused(composed):
+    with pytest.raises((InputError, InstantiationException), match="renderer: auto plans for"):
+        run(composed(*AS_BUILT, "renderer=auto"))
 
 
 def test_no_tolerances_are_not_the_lens_as_drawn(composed):

@@ -168,6 +168,9 @@ class Imaging(ABC):
         """
         return None
 
+    def check_made(self) -> None:
+        """Raise `InputError` where the training's renderer cannot image a lens that was made."""
+
     def judged_by_training(self) -> Self:
         """Return these views with the training's renderer for evaluation images too."""
         found = copy.copy(self)

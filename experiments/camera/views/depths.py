@@ -25,6 +25,7 @@ from dolens.experiments.camera.views.whole import (
     resized,
 )
 from dolens.optics.lens import Lens
+from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
@@ -120,6 +121,18 @@ class DepthViews(Imaging):
         super().expose(lens)
         if self.psf_diffraction != "none":
             self._f_number = axial_f_number(lens)
+
+    def check_made(self) -> None:
+        """Refuse a planned renderer: its window is for an image that stays on the axis.
+
+        Raises:
+            InputError: the line names what is allowed.
+        """
+        if isinstance(self.renderer, AutoRenderer):
+            raise InputError(
+                "renderer: auto plans for the lens as drawn, and a made one moves its image; "
+                "allowed with tolerances: psf (registration: chief_rays), rays"
+            )
 
     def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
         """The training's loss as a function of images of textures; of planes of their own."""
