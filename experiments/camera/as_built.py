@@ -114,7 +114,11 @@ class Manufacture:
         self.tolerances: Tolerances = tolerances_from(lens, given, settings.factor)
         if not self.tolerances.names:
             raise InputError("tolerances: none is given; allowed: null, or one parameter or more")
-        views.check_made()
+        if views.follows_the_design_alone:
+            raise InputError(
+                "renderer: auto plans for the lens as drawn, and a made one moves its image; "
+                "allowed with tolerances: psf (registration: chief_rays), rays"
+            )
         self._views = views
         self._pitch = views.sensor.pixel_pitch
         waves = tuple(views.scene.wavelengths)
@@ -167,13 +171,22 @@ class Manufacture:
         # The noise is held in the derivative as it is in the value.
         return own + (measured - own).detach()
 
-    def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor | None:
-        """Return what sensitivity adds to the loss; None where it has no weight."""
+    def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+        """Return what sensitivity adds to the loss, ()."""
         if not self._spots:
-            return None
+            return torch.zeros((), dtype=lens.dtype, device=lens.device)
         spreads = [
             expected_spread(lens, values, self.tolerances, spots, self._target)
             for spots in self._spots
         ]
         mean = torch.stack(spreads).mean() / self._pitch**2
         return self.settings.desensitising * mean
+
+
+def manufacture_of(
+    settings: AsBuilt | None, given: Mapping[str, Any] | None, lens: Lens, views: Imaging
+) -> Manufacture | None:
+    """Return what makes the lenses of a camera; None where no tolerances are given."""
+    if given is None:
+        return None
+    return Manufacture(settings or AsBuilt(), given, lens, views)

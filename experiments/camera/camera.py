@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.adversary import Adversary
-from dolens.experiments.camera.as_built import AsBuilt, Manufacture
+from dolens.experiments.camera.as_built import AsBuilt, manufacture_of
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.calibration import check as check_miscalibrations
@@ -24,23 +24,21 @@ from dolens.experiments.camera.evaluation import (
 )
 from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
-from dolens.experiments.camera.made_images import images_of_made_lenses, restored_in_parts
+from dolens.experiments.camera.made_images import restored_in_parts, training_images
 from dolens.experiments.camera.made_lens_scores import (
     MadeLensScores,
     made_lens_scores,
     made_lenses_figure_of,
-    spread_over_photographs,
 )
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
 from dolens.experiments.camera.settings import Reconstruction, Training
-from dolens.experiments.camera.views.base import Imaging, Views
+from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
-from dolens.sensor.batch_share import BatchShare
 from dolens.stages import stage as named_stage
 
 # Beside the scores.
@@ -142,11 +140,7 @@ class CameraModule(Camera):
         )
         views.expose(self.lens)
         check_miscalibrations(self.evaluation.miscalibrations, lens)
-        self.manufacture = (
-            None
-            if tolerances is None
-            else Manufacture(as_built or AsBuilt(), tolerances, self.lens, views)
-        )
+        self.manufacture = manufacture_of(as_built, tolerances, self.lens, views)
         self.made_scores: MadeLensScores | None = None
         self._made_crops: list[Tensor] = []
 
@@ -236,18 +230,17 @@ class CameraModule(Camera):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         with self.costs.making_images():
             values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
-            taken, functions = self._taken(values, batch, share)
+            taken, functions = training_images(self, self.manufacture, values, batch, share)
         self.costs.watch_backward(taken.raw)
         restored = restored_in_parts(self, taken, functions)
         truth = taken.truth.to(restored.dtype)
         terms = self.loss_over_views(restored, truth, shared=True)
         with self.exact():
             penalty, operands = self.lens_steps.penalty(values)
-            if self.manufacture is not None:
+            if self.manufacture is not None and self.manufacture.settings.desensitising:
                 sensitivity = self.manufacture.penalty(self.lens, values)
-                if sensitivity is not None:
-                    self.log("train/sensitivity", sensitivity.detach().float())
-                    penalty = penalty + sensitivity.to(penalty)
+                self.log("train/sensitivity", sensitivity.detach().float())
+                penalty = penalty + sensitivity.to(penalty)
         total = terms["total"]
         if not self.lens_steps.apart:
             total = total + penalty.to(restored.dtype)
@@ -266,22 +259,6 @@ class CameraModule(Camera):
             self.log_dict({f"train/{name}": value for name, value in numbers.items()})
             total = total + term
         return total
-
-    def _taken(
-        self, values: Mapping[str, Tensor], batch: Tensor, share: BatchShare | None
-    ) -> tuple[Views, list[Tensor | None]]:
-        """Image a batch through the lens as drawn, or its parts through lenses that are made.
-
-        Returns:
-            The images, and what functions the network gets for each equal part of the batch.
-        """
-        made = self.manufacture
-        if made is None or not made.in_training:
-            taken, functions = self.take(values, batch, "train", self.global_step, share=share)
-            return taken, [functions]
-        with self.exact():
-            lenses = made.for_step(self.lens, values, self.global_step)
-            return images_of_made_lenses(self, made, lenses, values, batch, share)
 
     def optimizer_step(
         self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
@@ -336,9 +313,8 @@ class CameraModule(Camera):
         if self.manufacture is not None and self.manufacture.settings.tested:
             crops, self._made_crops = torch.cat(self._made_crops), []
             of = photographs_of_crops(self.trainer, "test", len(crops))
-            crops = crops[spread_over_photographs(of, self.manufacture.settings.crops)]
             with named_stage("lenses as built"):
-                self.made_scores = made_lens_scores(self, self.manufacture, crops)
+                self.made_scores = made_lens_scores(self, self.manufacture, crops, of)
 
     def _log_evaluations(self) -> None:
         found = self.evaluation.scores(self.trainer, self.views.labels())

@@ -12,6 +12,34 @@ from dolens.experiments.camera.views.base import Views
 from dolens.sensor.batch_share import BatchShare
 
 
+def training_images(
+    camera: Camera,
+    manufacture: Manufacture | None,
+    values: Mapping[str, Tensor],
+    batch: Tensor,
+    share: BatchShare | None,
+) -> tuple[Views, list[Tensor | None]]:
+    """Return a training step's images, through the lens as drawn or through lenses that are made.
+
+    Args:
+        camera: trains.
+        manufacture: makes the lenses; None: the lens as drawn.
+        values: variables of the lens as drawn.
+        batch: textures (B, 3, h, w), linear light.
+        share: of a larger batch.
+
+    Returns:
+        The images, and what functions the network gets for each equal part of the batch.
+    """
+    step = camera.global_step
+    if manufacture is None or not manufacture.in_training:
+        taken, functions = camera.take(values, batch, "train", step, share=share)
+        return taken, [functions]
+    with camera.exact():
+        lenses = manufacture.for_step(camera.lens, values, step)
+        return images_of_made_lenses(camera, manufacture, lenses, values, batch, share)
+
+
 def images_of_made_lenses(
     camera: Camera,
     manufacture: Manufacture,

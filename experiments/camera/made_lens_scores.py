@@ -118,7 +118,9 @@ def _worst_decile(worst: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def made_lens_scores(camera: Camera, manufacture: Manufacture, crops: Tensor) -> MadeLensScores:
+def made_lens_scores(
+    camera: Camera, manufacture: Manufacture, crops: Tensor, photographs: Sequence[str]
+) -> MadeLensScores:
     """Image crops through lenses that are made, restore them, and compare them with the truth.
 
     The training's renderer makes the images: hundreds of lenses by rays would take hours.  All
@@ -127,8 +129,10 @@ def made_lens_scores(camera: Camera, manufacture: Manufacture, crops: Tensor) ->
     Args:
         camera: as trained.
         manufacture: makes the lenses.
-        crops: textures (B, 3, h, w), linear light.
+        crops: textures (B, 3, h, w), linear light, of which some are taken.
+        photographs: the photograph of each.
     """
+    crops = crops[spread_over_photographs(photographs, manufacture.settings.crops)]
     judging = camera.views.judged_by_training()
     design = camera.variables()
     started = time.perf_counter()

@@ -184,7 +184,7 @@ def test_sensitivity_counts_in_the_loss_by_its_weight(camera):
     torch.testing.assert_close(found[1], 100.0 * found[2], rtol=1e-6, atol=0.0)
     (slope,) = torch.autograd.grad(found[1], twice.variables.scaled)
     assert slope.abs().max() > 0.0
-    assert camera().manufacture.penalty(module.lens, module.variables()) is None
+    assert float(camera().manufacture.penalty(module.lens, module.variables())) == 0.0
 
 
 def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
@@ -222,7 +222,7 @@ def test_what_is_wrong_is_said_before_a_step(composed, override, words):
 
 def test_a_renderer_that_is_planned_for_the_lens_as_drawn_is_refused(composed):
     with pytest.raises((InputError, InstantiationException), match="renderer: auto plans for"):
-        run(composed(*AS_BUILT, "renderer=auto"))
+        run(composed(*(o for o in AS_BUILT if "renderer.pupil" not in o), "renderer=auto"))
 
 
 def test_no_tolerances_are_not_the_lens_as_drawn(composed):

@@ -168,8 +168,10 @@ class Imaging(ABC):
         """
         return None
 
-    def check_made(self) -> None:
-        """Raise `InputError` where the training's renderer cannot image a lens that was made."""
+    @property
+    def follows_the_design_alone(self) -> bool:
+        """Whether the training's renderer is planned for a lens whose image stays on the axis."""
+        return False
 
     def judged_by_training(self) -> Self:
         """Return these views with the training's renderer for evaluation images too."""

@@ -122,17 +122,10 @@ class DepthViews(Imaging):
         if self.psf_diffraction != "none":
             self._f_number = axial_f_number(lens)
 
-    def check_made(self) -> None:
-        """Refuse a planned renderer: its window is for an image that stays on the axis.
-
-        Raises:
-            InputError: the line names what is allowed.
-        """
-        if isinstance(self.renderer, AutoRenderer):
-            raise InputError(
-                "renderer: auto plans for the lens as drawn, and a made one moves its image; "
-                "allowed with tolerances: psf (registration: chief_rays), rays"
-            )
+    @property
+    def follows_the_design_alone(self) -> bool:
+        """Whether the training's renderer is planned: the window is for an image on the axis."""
+        return isinstance(self.renderer, AutoRenderer)
 
     def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
         """The training's loss as a function of images of textures; of planes of their own."""
