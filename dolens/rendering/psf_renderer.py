@@ -53,7 +53,9 @@ class PsfRenderer(Renderer):
         size: pixels along each side of a function, odd; light beyond is lost, and warned of.
         registration: `chief_rays`: functions are centred on the lens's own, distorted image points,
             and pixels look there; `pinhole`: on the undistorted ones, and shifts are part of the
-            functions, which is cheaper, and exact where shifts change little between fields.
+            functions, which is cheaper, and exact where shifts change little between fields;
+            `centred`: functions are centred on the lens's own image points and pixels look as in a
+            pinhole: distortion, and what a decentred lens shifts the image by, are left out.
         illumination: `map`: relative illumination is found on a finer grid than the functions, so
             that only their shape is interpolated; `functions`: it is as they have it.
         depths: `each` has functions of its own, or `one`, the middle in vergence, serves all.
@@ -68,7 +70,7 @@ class PsfRenderer(Renderer):
     fields: tuple[int, int] = (3, 3)
     pupil_samples: int = 32
     size: int = 65
-    registration: Literal["chief_rays", "pinhole"] = "chief_rays"
+    registration: Literal["chief_rays", "centred", "pinhole"] = "chief_rays"
     illumination: Literal["map", "functions"] = "map"
     depths: Literal["each", "one"] = "each"
     colours: Literal["each", "one"] = "each"
@@ -89,7 +91,7 @@ class PsfRenderer(Renderer):
         if self.pupil_samples < 1:
             raise InputError("renderer: pupil_samples must be at least 1")
         for key, allowed in (
-            ("registration", ("chief_rays", "pinhole")),
+            ("registration", ("chief_rays", "centred", "pinhole")),
             ("illumination", ("map", "functions")),
             ("depths", ("each", "one")),
             ("colours", ("each", "one")),
@@ -249,7 +251,7 @@ class PsfRenderer(Renderer):
         """
         imaging = imaging.showing(self.shared(imaging.scene))
         points = points or self.points()
-        centred = self.registration == "chief_rays"
+        centred = self.registration != "pinhole"
         if self.diffraction == "wave":
             return wave_point_spread_functions(imaging, points, self.size, centred)
         found = field_point_spread_functions(

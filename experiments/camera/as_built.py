@@ -114,10 +114,11 @@ class Manufacture:
         self.tolerances: Tolerances = tolerances_from(lens, given, settings.factor)
         if not self.tolerances.names:
             raise InputError("tolerances: none is given; allowed: null, or one parameter or more")
-        if views.follows_the_design_alone:
+        if not views.registers_moved_images:
             raise InputError(
-                "renderer: auto plans for the lens as drawn, and a made one moves its image; "
-                "allowed with tolerances: psf (registration: chief_rays), rays"
+                "renderer: a lens that is made moves its image; allowed with tolerances: "
+                "psf_narrow or another psf with registration: centred, or with "
+                "views.truth: chief_rays psf with registration: chief_rays, and rays"
             )
         self._views = views
         self._pitch = views.sensor.pixel_pitch

@@ -18,7 +18,7 @@ from dolens.rendering.psf import axial_point_spread_functions
 
 AS_BUILT = [
     "experiment=wavefront_coding_as_built",
-    *TINY,
+    *(o for o in TINY if not o.startswith("renderer=")),
     *TINY_NETWORK,
     "trainer.max_epochs=1",
     "as_built.tested=5",
@@ -100,19 +100,19 @@ def test_judging_lenses_are_those_of_every_seed_and_no_training_s(camera):
 
 
 def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
-    # A decentred stop cuts the sampled disc: only many samples see it move evenly.
-    module = camera(
-        "renderer=psf",
-        "renderer.fields=[1,1]",
-        "renderer.size=33",
-        "renderer.jitter=false",
-        "renderer.pupil_samples=160",
-        "as_built.calibration=own",
-        "readout=ideal",
-    )
+    module = camera("renderer.jitter=false", "renderer.pupil_samples=48", "readout=ideal")
+    # All but the stop: a disc that it cuts elsewhere is seen to move evenly by many samples only.
+    given = {
+        "elements.plate.tilt_[xy]": 0.3,
+        "elements.plate.decenter_[xy]": 0.2,
+        "surfaces.[123].curvature": {"half_range": 0.01, "relative": True},
+        "thicknesses.[1234]": 0.1,
+    }
+    settings = AsBuilt(calibration="own")
     batch = textures(1).double()
     weight = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(1)).double()
-    manufacture, scaled = module.manufacture, module.variables.scaled
+    manufacture = Manufacture(settings, given, module.lens, module.views)
+    scaled = module.variables.scaled
 
     def loss(at):
         scaled.data.copy_(at)
@@ -121,7 +121,7 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
         taken, own = images_of_made_lenses(module, manufacture, made, values, batch, None)
         return (taken.raw.double() * weight).sum() + 100.0 * own[0].double().square().sum()
 
-    start, step = scaled.detach().clone(), 0.1
+    start, step = scaled.detach().clone(), 0.01
     (gradient,) = torch.autograd.grad(loss(start), scaled)
     with torch.no_grad():
         differences = torch.stack(
@@ -130,7 +130,7 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
                 for shift in step * torch.eye(len(start), dtype=start.dtype)
             ]
         )
-    assert (gradient - differences).norm() < 0.05 * gradient.norm()
+    assert (gradient - differences).norm() < 0.01 * gradient.norm()
 
 
 def test_measured_functions_keep_their_light_and_the_derivative_of_the_exact_ones(camera):
@@ -220,9 +220,11 @@ def test_what_is_wrong_is_said_before_a_step(composed, override, words):
         run(composed(*AS_BUILT, override))
 
 
-def test_a_renderer_that_is_planned_for_the_lens_as_drawn_is_refused(composed):
-    with pytest.raises((InputError, InstantiationException), match="renderer: auto plans for"):
+def test_a_renderer_whose_images_stay_where_the_design_s_are_is_refused(composed):
+    with pytest.raises((InputError, InstantiationException), match="moves its image"):
         run(composed(*(o for o in AS_BUILT if "renderer.pupil" not in o), "renderer=auto"))
+    with pytest.raises((InputError, InstantiationException), match="moves its image"):
+        run(composed(*AS_BUILT, "renderer=rays"))
 
 
 def test_no_tolerances_are_not_the_lens_as_drawn(composed):

@@ -169,9 +169,9 @@ class Imaging(ABC):
         return None
 
     @property
-    def follows_the_design_alone(self) -> bool:
-        """Whether the training's renderer is planned for a lens whose image stays on the axis."""
-        return False
+    def registers_moved_images(self) -> bool:
+        """Whether an image that a decentred lens moves is compared with the truth it shows."""
+        return True
 
     def judged_by_training(self) -> Self:
         """Return these views with the training's renderer for evaluation images too."""

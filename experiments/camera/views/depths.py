@@ -28,6 +28,7 @@ from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
+from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene
@@ -123,9 +124,19 @@ class DepthViews(Imaging):
             self._f_number = axial_f_number(lens)
 
     @property
-    def follows_the_design_alone(self) -> bool:
-        """Whether the training's renderer is planned: the window is for an image on the axis."""
-        return isinstance(self.renderer, AutoRenderer)
+    def registers_moved_images(self) -> bool:
+        """Whether functions are centred, or the truth moves with the chief rays.
+
+        A planned renderer's window is for an image that stays on the axis.
+        """
+        if isinstance(self.renderer, PsfRenderer):
+            return self.renderer.registration == self._registration
+        return self.truth == "chief_rays" and not isinstance(self.renderer, AutoRenderer)
+
+    @property
+    def _registration(self) -> str:
+        """The registration of the functions of a lens that moves its image."""
+        return "chief_rays" if self.truth == "chief_rays" else "centred"
 
     def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
         """The training's loss as a function of images of textures; of planes of their own."""
@@ -192,8 +203,8 @@ class DepthViews(Imaging):
             size or self.psf_size,
             samples,
             values,
-            # Where image and truth move together with the chief rays, so do the functions.
-            centred=self.truth == "chief_rays",
+            # As they are in the images, whose truth is where their chief rays are.
+            centred=self.registers_moved_images,
         )
         if self.psf_diffraction == "none":
             return functions
