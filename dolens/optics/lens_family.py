@@ -17,7 +17,7 @@ from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import IndexMap, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
-from dolens.optics.rays import TracedRays
+from dolens.optics.rays import Rays, TracedRays
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,27 @@ class FamilyRays:
     position: Tensor
     direction: Tensor
     wavelength: Tensor | None = None
+
+    def of_each(self, lenses: int) -> "FamilyRays":
+        """Return the rays of a single lens as those of each of many, which copies nothing."""
+        return replace(
+            self,
+            position=self.position.expand(lenses, -1, -1),
+            direction=self.direction.expand(lenses, -1, -1),
+        )
+
+
+def shared_rays(rays: Rays) -> tuple[tuple[float, ...], FamilyRays]:
+    """Return the wavelengths (nm) of rays that all lenses share, and the rays as those of a single
+    lens.
+
+    Args:
+        rays: N of them.
+    """
+    given = torch.as_tensor(rays.wavelength, dtype=torch.float64, device=rays.position.device)
+    waves, which = given.expand(rays.position.shape[:-1]).unique(return_inverse=True)
+    found = FamilyRays(rays.position[None], rays.direction[None], which.int())
+    return tuple(waves.tolist()), found
 
 
 @dataclass(frozen=True)
@@ -325,8 +346,7 @@ class _Trace(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values, indices, position, direction, which, table):  # noqa: ANN001, ANN205
-        position = position.to(values).contiguous()
-        direction = direction.to(values).contiguous()
+        position, direction = (_with_whole_rows(t.to(values)) for t in (position, direction))
         found = kernels_of_lenses(position).trace(table, (position, direction, which))
         ctx.save_for_backward(values, indices, position, direction, found[3])
         ctx.which, ctx.codes, ctx.extras = which, table.codes, table.extras
@@ -346,3 +366,8 @@ class _Trace(torch.autograd.Function):
             (wanted[2], wanted[3], wanted[1]),
         )
         return of_values, of_indices if wanted[1] else None, of_rays, of_directions, None, None
+
+
+def _with_whole_rows(rays: Tensor) -> Tensor:
+    """Return rays (L, N, 3) with those of a lens contiguous; lenses may share them."""
+    return rays if rays[:1].is_contiguous() else rays.contiguous()
