@@ -1,6 +1,7 @@
 """Moments describe spots by sums over rays, which change in a known way when the sensor moves."""
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -33,7 +34,8 @@ def weighted_sums(
     Returns:
         (..., S, Q).
     """
-    return (_monomials(points, shares, origin, size, powers) @ shares).mT
+    found = _monomials(points, shares, origin, size, powers)
+    return torch.stack([found[..., r] @ w for r, w in _rays_of_spots(shares)], -2)
 
 
 def sums_and_derivatives(
@@ -56,19 +58,21 @@ def sums_and_derivatives(
     """
     lower, places = _LOWER, {pair: at for at, pair in enumerate(_LOWER)}
     found = _monomials(points, shares, origin, size, (*lower, *POWERS[len(lower) - 1 :]))
-    sums = (found[:, 1:] @ shares).mT
-    # Σ w·xᵏyˡ·∂X/∂p and Σ w·xᵏyˡ·∂Y/∂p of each spot, (K, S, 6, 2, F).
-    weighted = found[:, : len(lower)] * shares.sum(1)
     flat = derivatives.flatten(1, 2).mT
-    products = [weighted[..., rows] @ flat[:, rows] for rows in _rays_of_spots(shares)]
+    sums, products = [], []
+    for rows, weight in _rays_of_spots(shares):
+        sums.append(found[..., rows] @ weight)
+        products.append((found[:, : len(lower), rows] * weight) @ flat[:, rows])
+    # Σ w·xᵏyˡ·∂X/∂p and Σ w·xᵏyˡ·∂Y/∂p of each spot, (K, S, 6, 2, F).
     means = torch.stack(products, 1).unflatten(-1, derivatives.shape[1:3])
-    of_moments = means.new_zeros(*sums.shape, derivatives.shape[2])
+    moments = torch.stack(sums, 1)[..., 1:]
+    of_moments = means.new_zeros(*moments.shape, derivatives.shape[2])
     for row, (i, j) in enumerate(POWERS):
         if i:
             of_moments[:, :, row] += i * means[:, :, places[i - 1, j], 0]
         if j:
             of_moments[:, :, row] += j * means[:, :, places[i, j - 1], 1]
-    return sums, of_moments / size[:, None, None]
+    return moments, of_moments / size[:, None, None]
 
 
 def _monomials(
@@ -90,13 +94,15 @@ def _monomials(
     return torch.stack([x[i] * y[j] for i, j in powers], -2)
 
 
-def _rays_of_spots(shares: Tensor) -> list[slice | Tensor]:
-    """Return which rays are those of each spot: a slice where they are neighbours."""
-    spot = shares.argmax(1)
+def _rays_of_spots(shares: Tensor) -> list[tuple[slice | Tensor, Tensor]]:
+    """Return the rays of each spot, a slice where they are neighbours, and their weights."""
+    spot, weight = shares.argmax(1), shares.sum(1)
     if bool((spot.diff() >= 0).all()):
-        ends = spot.bincount(minlength=shares.shape[1]).cumsum(0).tolist()
-        return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
-    return [torch.nonzero(spot == number)[:, 0] for number in range(shares.shape[1])]
+        parts = weight.split(spot.bincount(minlength=shares.shape[1]).tolist())
+        ends = list(accumulate(map(len, parts)))
+        return [(slice(end - len(p), end), p) for end, p in zip(ends, parts, strict=True)]
+    rows = [torch.nonzero(spot == number)[:, 0] for number in range(shares.shape[1])]
+    return [(row, weight[row]) for row in rows]
 
 
 def shift_derivatives(sums: Tensor, size: Tensor) -> Tensor:

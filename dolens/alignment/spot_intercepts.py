@@ -10,16 +10,20 @@ from torch import Tensor
 from torch.func import jacfwd, vmap
 
 from dolens.optics.backend import choose_backend
+from dolens.optics.family_parts import intercept_parts, jacobian_parts
 from dolens.optics.lens import Lens
 from dolens.optics.lens_family import FamilyRays, LensFamily, shared_rays
-from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.rays import Components, Rays
 from dolens.optics.trace import trace_surfaces, trace_to_sensor
 from dolens.optimize.image_quality import without_edges
 
-# Rays traced at a time, a derivative counting like a ray: bounds intermediate results to 0.1 GB by
-# the kernels, which are called seldom enough; to 0.4 GB by the reference, whose operations are then
-# long beside what calling them takes.
-_BY_KERNELS, _BY_REFERENCE = 1 << 20, 1 << 18
+# Numbers that the kernels find at a time stay in the cache, 4 MB, where moments are made of them.
+_BY_KERNELS = 1 << 19
+# Numbers of a traced ray: position, direction, path length and status.
+_OF_A_RAY = 8
+# Rays that the reference traces at a time, a derivative counting like a ray: its operations are
+# long beside what calling them takes, and intermediate results take 0.4 GB.
+_BY_REFERENCE = 1 << 18
 
 
 class SpotIntercepts(Protocol):
@@ -27,22 +31,21 @@ class SpotIntercepts(Protocol):
 
     A ray that misses a surface or is reflected totally has an intercept that is finite, and means
     nothing.
-
-    Attributes:
-        rays_at_a_time: what a call should not exceed by much, a derivative counting like a ray.
     """
 
-    rays_at_a_time: int
+    def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield ray intercepts of lenses with parameters (K, F), some lenses at a time.
 
-    def points(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ray intercepts (K, 2, N), mm, of lenses with parameters (K, F), and which lenses
-        lose a ray (K,).
+        Yields:
+            Which lenses; points (k, 2, N), mm; and which lenses lose a ray (k,).
         """
         ...
 
-    def derivatives(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ray intercepts (K, 2, N), mm, and their derivatives (K, 2, F, N) with respect to
-        the parameters.
+    def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield ray intercepts with their derivatives, some lenses at a time.
+
+        Yields:
+            Which lenses; points (k, 2, N), mm; and derivatives (k, 2, F, N).
         """
         ...
 
@@ -76,23 +79,26 @@ class KernelIntercepts:
     Attributes:
         family: of lenses whose apertures clip nothing.
         rays: of a single lens.
-        rays_at_a_time: see `SpotIntercepts`.
     """
 
     family: LensFamily
     rays: FamilyRays
-    rays_at_a_time: int = _BY_KERNELS
 
-    def points(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `SpotIntercepts.points` does."""
-        hit = self.family.trace(values, self.rays.of_each(len(values)))
-        lost = (hit.status != int(Status.OK)).any(-1)
-        return hit.position[..., :2].mT, lost
+    def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield what `SpotIntercepts.points` does."""
+        size = self._lenses_at_a_time(_OF_A_RAY)
+        for rows, points, arrives in intercept_parts(self.family, values, self.rays, size):
+            yield rows, points.mT, ~arrives.all(-1)
 
-    def derivatives(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `SpotIntercepts.derivatives` does; both are zero of a ray that is lost."""
-        found = self.family.jacobians(values, self.rays.of_each(len(values)))
-        return found.values, found.derivatives
+    def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield what `SpotIntercepts.derivatives` does; both are zero of a ray that is lost."""
+        size = self._lenses_at_a_time(2 * (1 + self.family.count))
+        for rows, found in jacobian_parts(self.family, values, self.rays, size):
+            yield rows, found.values, found.derivatives
+
+    def _lenses_at_a_time(self, numbers: int) -> int:
+        """Return how many lenses have no more than `_BY_KERNELS`, with so many of each ray."""
+        return max(1, _BY_KERNELS // (numbers * self.rays.position.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -104,34 +110,46 @@ class ReferenceIntercepts:
         names: of F parameters.
         ray: N of them.
         wavelength: nm, theirs.
-        rays_at_a_time: see `SpotIntercepts`.
     """
 
     lens: Lens
     names: tuple[str, ...]
     ray: Components
     wavelength: float | Tensor
-    rays_at_a_time: int = _BY_REFERENCE
 
-    def points(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `SpotIntercepts.points` does."""
-        with one_thread():
-            points, margin = vmap(self._land)(values)
-        return points, ~(margin > 0.0)
+    def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield what `SpotIntercepts.points` does."""
+        for rows, (points, margin) in self._batches(self._land, values, 1):
+            yield rows, points, ~(margin > 0.0)
 
-    def derivatives(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `SpotIntercepts.derivatives` does."""
+    def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield what `SpotIntercepts.derivatives` does."""
 
-        def twice(row: Tensor) -> tuple[Tensor, Tensor]:
+        def points_twice(row: Tensor) -> tuple[Tensor, Tensor]:
             points, _ = self._land(row)
             return points, points.detach()
 
-        differentiated: Callable[[Tensor], tuple[Tensor, Tensor]] = jacfwd(twice, has_aux=True)
-        # Lenses cannot have threads of their own: PyTorch counts the levels of forward derivatives
-        # for the whole process.
-        with one_thread():
-            derivatives, points = vmap(differentiated)(values)
-        return points, derivatives.mT
+        differentiated = jacfwd(points_twice, has_aux=True)
+        for rows, found in self._batches(differentiated, values, 1 + len(self.names)):
+            derivatives, points = found
+            yield rows, points, derivatives.mT
+
+    @torch.no_grad()
+    def _batches(
+        self, function: Callable[..., tuple[Tensor, Tensor]], values: Tensor, copies: int
+    ) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
+        """Yield which lenses, and a function of each of them, on one thread.
+
+        Batches cannot have threads of their own: PyTorch counts the levels of forward derivatives
+        for the whole process.
+        """
+        size = max(1, _BY_REFERENCE // (copies * self.ray.x.numel()))
+        first = 0
+        for part in values.split(size):
+            with one_thread():
+                found = vmap(function)(part)
+            yield slice(first, first + len(part)), found
+            first += len(part)
 
     def _land(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return points (2, N), mm, and the least of what ends a ray, positive where all arrive."""

@@ -1,6 +1,6 @@
 """Moments describe the spots of a lens in a few numbers each, with their derivatives."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -61,10 +61,15 @@ class MomentModel:
         Raises:
             InputError: a ray of such a lens misses a surface or is reflected totally.
         """
-        points, lost = self._in_chunks(self._arrive, 1, *self._split(errors))
+        values, across = self._split(errors)
+        parts = [
+            (points - across[rows, :, None], lost)
+            for rows, points, lost in self.intercepts.points(values)
+        ]
+        found, lost = (torch.cat(part) for part in zip(*parts, strict=True))
         if bool(lost.any()):
             raise InputError(f"misalignments: {int(lost.sum())} of {len(lost)} lenses lose rays")
-        return points
+        return found
 
     @torch.no_grad()
     def moments(self, errors: Tensor, origin: Tensor) -> Tensor:
@@ -80,17 +85,29 @@ class MomentModel:
         Returns:
             (K, S, 9).
         """
-        return self.convolved(self._in_chunks(self._sums, 1, *self._split(errors), origin)[0])
+        values, across = self._split(errors)
+        # Points on a displaced sensor about an origin on it: about another one on that as designed.
+        about = origin + across[:, None]
+        parts = [
+            weighted_sums(points, self.shares, about[rows], self.size, POWERS)
+            for rows, points, _ in self.intercepts.points(values)
+        ]
+        return self.convolved(torch.cat(parts))
 
     @torch.no_grad()
     def moments_and_jacobian(self, errors: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
         """Return the moments (K, S, 9) and their derivatives (K, S, 9, P) with respect to the
         parameters.
         """
-        copies = 1 + len(self.start)
-        sums, jacobian = self._in_chunks(
-            self._derivatives, copies, *self._split(errors), origin
-        )
+        values, across = self._split(errors)
+        about = origin + across[:, None]
+        parts = [
+            sums_and_derivatives(points, derivatives, self.shares, about[rows], self.size)
+            for rows, points, derivatives in self.intercepts.derivatives(values)
+        ]
+        sums, traced = (torch.cat(part) for part in zip(*parts, strict=True))
+        # The sensor's place across needs no rays.
+        jacobian = traced @ self.traced.mT + shift_derivatives(sums, self.size) @ self.across.mT
         if self.pixels is not None:
             matrix = pixel_convolution(POWERS, self.pixels.pitch / self.size)
             jacobian = matrix[..., :-1] @ jacobian
@@ -106,37 +123,6 @@ class MomentModel:
         """Return values that are traced (K, F), and the sensor's place across (K, 2)."""
         errors = errors.to(self.start)
         return self.start + errors @ self.traced, errors @ self.across
-
-    def _arrive(self, values: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ray intercepts (K, 2, N) on the sensor at its place (K, 2), and which lenses lose
-        rays.
-        """
-        points, lost = self.intercepts.points(values)
-        return points - across[..., None], lost
-
-    def _sums(self, values: Tensor, across: Tensor, origin: Tensor) -> tuple[Tensor]:
-        """Return moments (K, S, 9)."""
-        points, _ = self._arrive(values, across)
-        return (weighted_sums(points, self.shares, origin, self.size, POWERS),)
-
-    def _derivatives(self, values: Tensor, across: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Return moments (K, S, 9), and derivatives (K, S, 9, P): the sensor's place across needs
-        no rays.
-        """
-        points, derivatives = self.intercepts.derivatives(values)
-        points = points - across[..., None]
-        found, traced = sums_and_derivatives(points, derivatives, self.shares, origin, self.size)
-        moved = shift_derivatives(found, self.size) @ self.across.mT
-        return found, traced @ self.traced.mT + moved
-
-    def _in_chunks(
-        self, batch: Callable[..., tuple[Tensor, ...]], copies: int, *rows: Tensor
-    ) -> list[Tensor]:
-        """Return a function of a batch, computed some rows at a time."""
-        size = max(1, self.intercepts.rays_at_a_time // (copies * len(self.shares)))
-        chunks = zip(*(part.split(size) for part in rows), strict=True)
-        parts = [batch(*chunk) for chunk in chunks]
-        return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
 def moment_model(
@@ -178,7 +164,7 @@ def moment_model(
     shares = spots.weight.new_zeros(len(spots.weight), spots.count)
     shares[torch.arange(len(spots.weight)), spots.spot] = spots.weight
     with torch.no_grad():
-        points = intercepts.points(start[None])[0][0]
+        ((_, (points,), _),) = intercepts.points(start[None])
         centroids = (points @ shares).T
         apart = points - centroids.T[:, spots.spot]
         own_size = (apart.square().sum(0) @ shares).sqrt()
