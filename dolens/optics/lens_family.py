@@ -356,7 +356,8 @@ class _Trace(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values, indices, position, direction, which, table):  # noqa: ANN001, ANN205
-        position, direction = (_with_whole_rows(t.to(values)) for t in (position, direction))
+        position = position.to(values).contiguous()
+        direction = direction.to(values).contiguous()
         found = kernels_of_lenses(position).trace(table, (position, direction, which))
         ctx.save_for_backward(values, indices, position, direction, found[3])
         ctx.which, ctx.codes, ctx.extras = which, table.codes, table.extras
@@ -376,8 +377,3 @@ class _Trace(torch.autograd.Function):
             (wanted[2], wanted[3], wanted[1]),
         )
         return of_values, of_indices if wanted[1] else None, of_rays, of_directions, None, None
-
-
-def _with_whole_rows(rays: Tensor) -> Tensor:
-    """Return rays (L, N, 3) with those of a lens contiguous; lenses may share them."""
-    return rays if rays[:1].is_contiguous() else rays.contiguous()
