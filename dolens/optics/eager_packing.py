@@ -24,10 +24,12 @@ class Prepared(NamedTuple):
     """What calls for the same layout in one precision have in common.
 
     Attributes:
+        kernels: the module of the CPU's.
         numbers: how records are made of numbers; see `kernels.cpu.stored_numbers`.
         frames: of the kernels' programs.
     """
 
+    kernels: Any
     numbers: Any
     frames: dict[bool, Any]
 
@@ -35,10 +37,11 @@ class Prepared(NamedTuple):
 @cached_tensors(maxsize=256)
 def prepared(layout: Records, dtype: torch.dtype) -> Prepared:
     """Return what calls share."""
-    numbers = kernels_of(layout.constants).StoredNumbers(
+    kernels = kernels_of(layout.constants)
+    numbers = kernels.StoredNumbers(
         layout.constants, layout.places, layout.sources, layout.signs, layout.count, dtype
     )
-    return Prepared(numbers, {})
+    return Prepared(kernels, numbers, {})
 
 
 def eager_table(found: LaidOut, indices: Tensor) -> SurfaceTable:

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from dolens.kernels import operators
-from dolens.kernels.eager import is_eager
-from dolens.kernels.operators import kernels_of
+from dolens.kernels.eager import are_plain, is_eager
 from dolens.kernels.table import SurfaceTable
 from dolens.optics.eager_packing import eager_indices, eager_table, prepared
 from dolens.optics.lens_numbers import LaidOut
@@ -27,7 +26,7 @@ def traces_eagerly(found: LaidOut, wavelength: float | Tensor, *rays: Tensor) ->
     if rays[0].device.type != "cpu":
         return False
     waves = (wavelength,) if isinstance(wavelength, Tensor) else ()
-    return is_eager((*rays, *waves, *found.scalars, *found.arrays))
+    return is_eager((*rays, *waves, *found.arrays)) and are_plain(found.scalars)
 
 
 def trace_eagerly(
@@ -105,11 +104,11 @@ class _Trace(torch.autograd.Function):
         rays = (position, direction, which)
         if is_eager(given) and not torch.is_grad_enabled():
             table = SurfaceTable(values, indices, layout.codes, layout.extras)
-            of_numbers, frames = prepared(layout, values.dtype)
-            of_position, of_direction, sums = kernels_of(position).sweep(
-                table, *rays, status, cotangents, wanted, frames
+            known = prepared(layout, values.dtype)
+            of_position, of_direction, sums = known.kernels.sweep(
+                table, *rays, status, cotangents, wanted, known.frames
             )
-            flat = of_numbers.cotangents(sums) if True in needs[5:] else None
+            flat = known.numbers.cotangents(sums) if True in needs[5:] else None
             of_indices = sums[values.numel() :].reshape(indices.shape) if wanted[2] else None
         else:
             # The gradient's own graph: its operator says that it has no derivative.
@@ -135,8 +134,8 @@ def _traced(
     direction: Tensor,
     which: Tensor | None,
 ) -> Traced:
-    frames = prepared(found.layout, table.values.dtype).frames
-    return kernels_of(position).trace(table, position, direction, which, frames)
+    known = prepared(found.layout, table.values.dtype)
+    return known.kernels.trace(table, position, direction, which, known.frames)
 
 
 def _split(flat: Tensor, found: LaidOut) -> Sequence[Tensor]:

@@ -273,7 +273,7 @@ class Program:
 
     def _job_in(self, memory: Memory) -> int:
         """Write the job of a worker with this memory into it, and return its address."""
-        job = memory.held[: self.job.nbytes].view(np.int64)
+        job = memory.held[: jobs.LENGTH]
         job[:] = self.job
         for place, begin in self._frame.parts:
             job[place] = memory.address + begin

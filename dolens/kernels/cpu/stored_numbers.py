@@ -4,7 +4,7 @@ The parameters of a lens are some ten or hundred tensors of one number.  PyTorch
 join these than to trace a thousand rays.
 """
 
-import ctypes
+from array import array
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -92,7 +92,7 @@ class StoredNumbers:
         self._real, self._kind = _KINDS[dtype]
         # Held: the sum has their addresses.
         self._arrays = (constants.to(dtype), places, sources, signs.to(dtype))
-        addresses = (array.data_ptr() for array in self._arrays)
+        addresses = map(Tensor.data_ptr, self._arrays)
         self._sum = np.array([*addresses, self._length, len(places), count], dtype=np.int64)
         self._address = self._sum.ctypes.data
 
@@ -104,14 +104,14 @@ class StoredNumbers:
         addresses = [*map(Tensor.data_ptr, scalars)]
         if 0 in addresses or {*map(_DTYPE, scalars)} != {self.dtype}:
             return None
-        flat = [array.detach().reshape(-1).to(self.dtype).contiguous() for array in arrays]
-        for array in flat:
-            begin, size = array.data_ptr(), array.itemsize
-            addresses += range(begin, begin + size * array.numel(), size)
-        of_numbers = (ctypes.c_int64 * len(addresses))(*addresses)
+        flat = [tensor.detach().reshape(-1).to(self.dtype).contiguous() for tensor in arrays]
+        for tensor in flat:
+            begin, size = tensor.data_ptr(), tensor.itemsize
+            addresses += range(begin, begin + size * tensor.numel(), size)
+        of_numbers = array("q", addresses)  # of int64
         found = torch.empty(self._length, dtype=self.dtype)
         run = function_at(compiler.compile_driver(packer, self._real))
-        run(self._address, ctypes.addressof(of_numbers), found.data_ptr())
+        run(self._address, of_numbers.buffer_info()[0], found.data_ptr())
         return found
 
     def cotangents(self, of_values: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class Memory(NamedTuple):
     Attributes:
         size: bytes from `address` on.
         address: of a line of the cache.
-        held: it, as bytes.
+        held: it, as integers of 8 bytes.
     """
 
     size: int
@@ -67,8 +67,9 @@ def scratch(size: int, worker: int) -> Memory:
     kept = _own.__dict__.setdefault("memory", {})
     memory = kept.get(worker)
     if memory is None or memory.size < size:
-        held = np.empty(size + _LINE, dtype=np.uint8)
-        held = held[-held.ctypes.data % _LINE :][:size]
+        length, line = -(-size // 8), _LINE // 8
+        held = np.empty(length + line, dtype=np.int64)
+        held = held[-held.ctypes.data % _LINE // 8 :][:length]
         memory = Memory(size, held.ctypes.data, held)
         if size <= _KEPT:
             kept[worker] = memory
