@@ -125,12 +125,13 @@ def _joined(
         position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
         return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(ray.x.shape)
     shape = _shape(rays)
-    whole = (*shape, 3)
+    whole, like = (*shape, 3), system.sensor_distance
 
     def flat(vectors: Tensor) -> Tensor:
         """As the user gave them: a view of (..., 3), which a kernel reads in place."""
-        vectors = vectors.to(system.device, system.dtype)
-        if vectors.shape == whole and len(shape) == 1:
+        if vectors.dtype is not like.dtype or vectors.device != like.device:
+            vectors = vectors.to(like.device, like.dtype)
+        if vectors.ndim == 2 and vectors.shape == whole:
             return vectors
         return vectors.expand(whole).reshape(-1, 3)
 
