@@ -31,6 +31,8 @@ METHODS = ("DifferentialEvolution", "DualAnnealing", "BasinHopping", "CMAES", "P
 SEARCH = 0.9
 # Random lenses of which the best is a start, and the step of basin hopping within the bounds.
 _DRAWN, _HOP = 20, 0.1
+# Of a number whose square the merit sums.
+_MOST = 1e3
 
 
 class Search:
@@ -67,10 +69,8 @@ class Search:
         low, high = self.task.bounds
         outside = np.maximum(np.maximum(low - values, values - high), 0.0) / (high - low)
         limits = np.concatenate([self.task.deviations(lens, beams), outside])
-        rows = np.nan_to_num(
-            np.concatenate([spots / np.sqrt(spots.size), self.task.weight_of_limits * limits]),
-            nan=1.0,
-        )
+        every = [spots / np.sqrt(spots.size), self.task.weight_of_limits * limits]
+        rows = np.clip(np.nan_to_num(np.concatenate(every), nan=1.0), -_MOST, _MOST)
         self.lenses += 1
         merit = float(rows @ rows)
         if merit < self.best:
@@ -144,10 +144,13 @@ class Search:
                 add("asphere_coeff", surface, coeff_number=number + 1)
 
     def start(self) -> Array:
-        """Return the best of some random lenses within the bounds."""
+        """Return the best of some random lenses within the bounds; aspheres begin as paraboloids,
+        since random coefficients within theirs let no ray pass.
+        """
         self.check()
         low, high = self.task.bounds
         drawn = self.random.uniform(low, high, (_DRAWN, low.size))
+        drawn[:, low.size - sum(self.task.terms) :] = 0.0
         rows = [self.rows(built(self.task, values)) for values in drawn]
         return drawn[int(np.argmin([row @ row for row in rows]))]
 

@@ -9,8 +9,8 @@ from lens_search.plain_task import STOP, Array, Beams, Lens, PlainTask
 
 # A spot of rays that fail, over the focal length: of any, and of all more.
 _ANY_FAIL, _ALL_FAIL = 0.1, 1.0
-# How exactly rays meet aspheres, mm: differences need it.
-_NEWTON = 1e-11
+# How exactly rays meet aspheres, mm, since differences need it, and steps to it at most.
+_NEWTON = {"tol": 1e-11, "max_iter": 30}
 
 
 def built(task: PlainTask, values: Array) -> Any:
@@ -51,7 +51,7 @@ def built(task: PlainTask, values: Array) -> Any:
             c = float(lens.curvatures[number])
             if task.terms[number]:
                 # Its tracer looks for the crossing from that with the base, here the plane.
-                row |= {"surface_type": "even_asphere", "radius": np.inf, "tol": _NEWTON}
+                row |= {"surface_type": "even_asphere", "radius": np.inf, **_NEWTON}
                 row["coefficients"] = [0.5 * c, *map(float, lens.coefficients[number])]
             else:
                 row["radius"] = 1.0 / c if c else np.inf
@@ -145,16 +145,10 @@ class Rays:
         for field in range(fields):
             mine = self.group == field
             w = weight[mine]
-            if failed[mine].any():
-                lost = 1.0 - w.sum()
-                spots[field] = _ANY_FAIL + _ALL_FAIL * lost
-                if not w.any():
-                    continue
-            else:
-                spots[field] = 0.0
-            middle = (w * y[mine]).sum() / w.sum()
+            middle = (w * y[mine]).sum() / max(w.sum(), 1e-12)
             square = (w * (x[mine] ** 2 + (y[mine] - middle) ** 2)).sum()
-            spots[field] += np.sqrt(square) / f
+            lost = _ANY_FAIL + _ALL_FAIL * (1.0 - w.sum()) if failed[mine].any() else 0.0
+            spots[field] = np.sqrt(square) / f + lost
         radii = np.nan_to_num(np.hypot(found.x, found.y))
         chief = self.group >= fields
         beams = Beams(

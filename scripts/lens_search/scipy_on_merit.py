@@ -51,6 +51,14 @@ class Objective:
         self.started, self.count = time.process_time(), 0
         self.best, self.where = np.inf, None
 
+    def start(self, random: np.random.Generator, bounds: list[tuple[float, float]]) -> Array:
+        """Return a random lens within the bounds; aspheres begin as paraboloids, since random
+        coefficients within theirs let no ray pass.
+        """
+        found = random.uniform(*np.array(bounds).T)
+        found[self.merit.arrangement.image_column + 1 :] = 0.0
+        return found
+
     def both(self, u: Array) -> tuple[Array, Array]:
         """Return values (L,) and gradients (L, P) of lenses u (L, P)."""
         if time.process_time() - self.started > self.seconds:
@@ -97,18 +105,18 @@ def annealing(of: Objective, bounds: list[tuple[float, float]], seed: int) -> No
 
 def hopping(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
     """Run SciPy's basin hopping from random lenses, a new one after thirty hops."""
-    random, ends = np.random.default_rng(seed), np.array(bounds)
+    random = np.random.default_rng(seed)
     local = {"method": "L-BFGS-B", "jac": True, "bounds": bounds}
     while True:
-        start = random.uniform(*ends.T)
+        start = of.start(random, bounds)
         basinhopping(of.one, start, niter=30, stepsize=0.1, minimizer_kwargs=local, rng=random)
 
 
 def restarts(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
     """Descend from random lenses."""
-    random, ends = np.random.default_rng(seed), np.array(bounds)
+    random = np.random.default_rng(seed)
     while True:
-        minimize(of.one, random.uniform(*ends.T), jac=True, method="L-BFGS-B", bounds=bounds)
+        minimize(of.one, of.start(random, bounds), jac=True, method="L-BFGS-B", bounds=bounds)
 
 
 METHODS: dict[str, Method] = {
