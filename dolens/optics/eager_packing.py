@@ -1,17 +1,17 @@
 """Packing without PyTorch's operations, for a lens on the CPU in eager mode.
 
-A record is a few sums of numbers; NumPy takes a fifth of the time to begin one.  The sums are those
-of `dolens.optics.packing`, in the same order.
+A record is a few sums of numbers; one call of a kernel takes a fifth of the time that PyTorch's
+operations take to begin.  The sums are those of `dolens.optics.packing`, in the same order.
 """
 
-from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.kernels.operators import kernels_of
+from dolens.kernels.table import SurfaceTable
 from dolens.optics.lens_numbers import LaidOut
 from dolens.optics.packing import packed_values, record_indices
 from dolens.optics.records import Records
@@ -20,46 +20,37 @@ from dolens.optics.records import Records
 _WAVELENGTHS = 64
 
 
-class _Fixed(NamedTuple):
-    """A layout's arrays; see `Records`."""
+class Prepared(NamedTuple):
+    """What calls for the same layout in one precision have in common.
 
-    constants: np.ndarray
-    places: np.ndarray
-    sources: np.ndarray
-    signs: np.ndarray
+    Attributes:
+        kernels: the module of the CPU's.
+        numbers: how records are made of numbers; see `kernels.cpu.stored_numbers`.
+        frames: of the kernels' programs.
+    """
+
+    kernels: Any
+    numbers: Any
+    frames: dict[bool, Any]
 
 
-@lru_cache(maxsize=256)
-def _in_precision(layout: Records, dtype: np.dtype) -> _Fixed:
-    constants, signs = layout.constants.numpy(), layout.signs.numpy()
-    return _Fixed(
-        constants.astype(dtype),
-        layout.places.numpy(),
-        layout.sources.numpy(),
-        signs.astype(dtype),
+@cached_tensors(maxsize=256)
+def prepared(layout: Records, dtype: torch.dtype) -> Prepared:
+    """Return what calls share."""
+    kernels = kernels_of(layout.constants)
+    numbers = kernels.StoredNumbers(
+        layout.constants, layout.places, layout.sources, layout.signs, layout.count, dtype
     )
+    return Prepared(kernels, numbers, {})
 
 
-def eager_values(found: LaidOut) -> Tensor:
-    """Return what `packed_values` does, without a graph."""
-    numbers = kernels_of(found.scalars[0]).read(found.scalars)
-    if numbers is None:
-        return packed_values(found.layout, found.scalars, found.arrays).detach()
-    if found.arrays:
-        parts = (array.detach().reshape(-1).numpy() for array in found.arrays)
-        numbers = np.concatenate([numbers, *(part.astype(numbers.dtype) for part in parts)])
-    fixed = _in_precision(found.layout, numbers.dtype)
-    values = fixed.constants.copy()
-    np.add.at(values, fixed.places, numbers[fixed.sources] * fixed.signs)
-    return torch.from_numpy(values)
-
-
-def eager_cotangents(layout: Records, of_values: np.ndarray, count: int) -> Tensor:
-    """Return what `cotangents_of_numbers` does."""
-    fixed = _in_precision(layout, of_values.dtype)
-    found = np.zeros(count, of_values.dtype)
-    np.add.at(found, fixed.sources, of_values[fixed.places] * fixed.signs)
-    return torch.from_numpy(found)
+def eager_table(found: LaidOut, indices: Tensor) -> SurfaceTable:
+    """Return the table of a lens, its values those of `packed_values` without a graph."""
+    layout, scalars = found.layout, found.scalars
+    values = prepared(layout, scalars[0].dtype).numbers.records(scalars, found.arrays)
+    if values is None:
+        values = packed_values(layout, scalars, found.arrays).detach()
+    return SurfaceTable(values, indices.contiguous(), layout.codes, layout.extras)
 
 
 def eager_indices(found: LaidOut, wavelength: float | Tensor) -> Tensor:

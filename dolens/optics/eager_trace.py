@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from dolens.kernels import operators
-from dolens.kernels.eager import is_eager
-from dolens.kernels.operators import kernels_of
+from dolens.kernels.eager import are_plain, is_eager
 from dolens.kernels.table import SurfaceTable
-from dolens.optics.eager_packing import eager_cotangents, eager_indices, eager_values
+from dolens.optics.eager_packing import eager_indices, eager_table, prepared
 from dolens.optics.lens_numbers import LaidOut
 from dolens.optics.packing import cotangents_of_numbers, packed_values, record_indices
 
@@ -27,7 +26,7 @@ def traces_eagerly(found: LaidOut, wavelength: float | Tensor, *rays: Tensor) ->
     if rays[0].device.type != "cpu":
         return False
     waves = (wavelength,) if isinstance(wavelength, Tensor) else ()
-    return is_eager((*rays, *waves, *found.scalars, *found.arrays))
+    return is_eager((*rays, *waves, *found.arrays)) and are_plain(found.scalars)
 
 
 def trace_eagerly(
@@ -50,7 +49,7 @@ def trace_eagerly(
     inputs = (indices, position, direction, *found.scalars, *found.arrays)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         return _Trace.apply(found, which, *inputs)
-    return kernels_of(position).trace(_table(found, indices), position, direction, which)
+    return _traced(found, eager_table(found, indices), position, direction, which)
 
 
 def trace_by_operator(
@@ -81,8 +80,8 @@ class _Trace(torch.autograd.Function):
         *numbers: Tensor,
     ) -> Traced:
         """Trace, and keep the rays and the lens's records."""
-        table = _table(found, indices)
-        traced = kernels_of(position).trace(table, position, direction, which)
+        table = eager_table(found, indices)
+        traced = _traced(found, table, position, direction, which)
         status, surface = traced[3:]
         ctx.mark_non_differentiable(status, surface)
         ctx.set_materialize_grads(False)
@@ -103,14 +102,14 @@ class _Trace(torch.autograd.Function):
         wanted = (needs[3], needs[4], needs[2])
         layout = found.layout
         rays = (position, direction, which)
-        count = sum(map(Tensor.numel, numbers))
         if is_eager(given) and not torch.is_grad_enabled():
             table = SurfaceTable(values, indices, layout.codes, layout.extras)
-            of_position, of_direction, summed, of_waves = kernels_of(position).sweep(
-                table, *rays, status, cotangents, wanted
+            known = prepared(layout, values.dtype)
+            of_position, of_direction, sums = known.kernels.sweep(
+                table, *rays, status, cotangents, wanted, known.frames
             )
-            flat = eager_cotangents(layout, summed, count) if any(needs[5:]) else None
-            of_indices = torch.from_numpy(of_waves) if wanted[2] else None
+            flat = known.numbers.cotangents(sums) if True in needs[5:] else None
+            of_indices = sums[values.numel() :].reshape(indices.shape) if wanted[2] else None
         else:
             # The gradient's own graph: its operator says that it has no derivative.
             scalars = len(found.scalars)
@@ -118,7 +117,7 @@ class _Trace(torch.autograd.Function):
                 packed_values(layout, numbers[:scalars], numbers[scalars:]),
                 *(indices, *rays, layout.codes, layout.extras, status, *cotangents, list(wanted)),
             )
-            flat = cotangents_of_numbers(layout, of_values, count)
+            flat = cotangents_of_numbers(layout, of_values, layout.count)
         return (
             *(None, None),
             of_indices if wanted[2] else None,
@@ -128,9 +127,15 @@ class _Trace(torch.autograd.Function):
         )
 
 
-def _table(found: LaidOut, indices: Tensor) -> SurfaceTable:
-    layout = found.layout
-    return SurfaceTable(eager_values(found), indices.contiguous(), layout.codes, layout.extras)
+def _traced(
+    found: LaidOut,
+    table: SurfaceTable,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+) -> Traced:
+    known = prepared(found.layout, table.values.dtype)
+    return known.kernels.trace(table, position, direction, which, known.frames)
 
 
 def _split(flat: Tensor, found: LaidOut) -> Sequence[Tensor]:

@@ -5,9 +5,10 @@ is made anew as soon as anything stands in the place of a tensor, a surface, an 
 that it was made of.
 """
 
-from collections.abc import Callable, Mapping
-from operator import is_
-from typing import Any
+from collections.abc import Callable
+from itertools import chain
+from operator import attrgetter, is_, itemgetter
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,7 @@ class KeptSystem:
     """Holds one system, and what it was made of.  A copy of a lens keeps its own."""
 
     def __init__(self) -> None:
-        self._kept: tuple[list[Any], OpticalSystem | None] = ([], None)
+        self._kept: tuple[_Places, _Parts, OpticalSystem] | None = None
 
     def __deepcopy__(self, memo: object) -> "KeptSystem":
         """Return an empty one."""
@@ -40,48 +41,87 @@ class KeptSystem:
         """
         if torch.compiler.is_compiling():
             return make({})
-        parts = _parts(lens)
-        known, system = self._kept  # at once: other threads may trace the same lens
-        if system is not None and len(parts) == len(known) and all(map(is_, parts, known)):
-            return system
+        kept = self._kept  # at once: other threads may trace the same lens
+        if kept is not None:
+            places, known, system = kept
+            if places.are_of(lens) and known.are_the_same(places.parts(lens)):
+                return system
+        places = _places(lens)
+        parts = places.parts(lens)
         system = make({})
-        if _may_stay(parts, system):
-            self._kept = (parts, system)
+        if _may_stay(parts.things, system):
+            self._kept = (places, parts, system)
         return system
 
 
 # Of a lens; its materials may be a list, whose entries are looked at.
-_ATTRIBUTES = ("stop", "backend", "reversals", "fields")
+_ATTRIBUTES = itemgetter("stop", "backend", "reversals", "fields")
+_OF_SURFACE = attrgetter("aperture")
+_OF_ELEMENT = attrgetter("first", "last", "pivot")
 
 
-def _parts(lens: nn.Module) -> list[Any]:
-    """Return all that a system is made of: two lists of the same objects make the same system."""
-    own, tables = lens.__dict__, lens._modules
-    parts = [*(own[name] for name in _ATTRIBUTES), *own["materials"], *lens._parameters.values()]
-    parts += _table(tables, "thicknesses")._parameters.values()
-    for surface in _table(tables, "surfaces")._modules.values():
-        parts += (surface, surface.aperture, surface.phase)
-        _add_tensors(parts, surface)
-        if surface.phase is not None:
-            _add_tensors(parts, surface.phase)
-    for element in _table(tables, "elements")._modules.values():
-        parts += (element, element.first, element.last, element.pivot)
-        _add_tensors(parts, element)
-    return parts
+class _Parts(NamedTuple):
+    """All that a system is made of, and the names of these in their tables."""
+
+    things: list[Any]
+    names: list[str]
+
+    def are_the_same(self, others: "_Parts") -> bool:
+        """Return whether the same objects have the same names: they make the same system."""
+        things = others.things
+        if len(self.things) != len(things) or self.names != others.names:
+            return False
+        return all(map(is_, self.things, things))
 
 
-def _table(tables: Mapping[str, nn.Module | None], name: str) -> Any:
-    return tables[name]
+class _Places(NamedTuple):
+    """All that a system is made of stands here.
+
+    Attributes:
+        tables: of PyTorch's, with parameters, buffers and modules; those of the lens itself first.
+        empty: such tables without an entry.
+        surfaces: the modules themselves.
+        elements: likewise.
+    """
+
+    tables: tuple[dict[str, Any], ...]
+    empty: tuple[dict[str, Any], ...]
+    surfaces: tuple[nn.Module, ...]
+    elements: tuple[nn.Module, ...]
+
+    def are_of(self, lens: nn.Module) -> bool:
+        """Return whether they are all of a lens's places: tables in other modules are found from
+        its own.
+        """
+        if lens._parameters is not self.tables[0] or lens._modules is not self.tables[1]:
+            return False
+        return not any(self.empty)
+
+    def parts(self, lens: nn.Module) -> _Parts:
+        """Return what stands there now."""
+        own = lens.__dict__
+        things = [*_ATTRIBUTES(own), *own["materials"]]
+        things += chain.from_iterable(map(dict.values, self.tables))
+        things += map(_OF_SURFACE, self.surfaces)
+        things += chain.from_iterable(map(_OF_ELEMENT, self.elements))
+        return _Parts(things, [*chain.from_iterable(self.tables)])
 
 
-def _add_tensors(parts: list[Any], module: nn.Module) -> None:
-    """Add the names and the tensors of a module itself."""
-    parameters, buffers = module._parameters, module._buffers
-    parts += parameters
-    parts += parameters.values()
-    if buffers:
-        parts += buffers
-        parts += buffers.values()
+def _places(lens: nn.Module) -> _Places:
+    """Return where the parts of a lens stand."""
+    modules: Any = lens._modules
+    surfaces = tuple(modules["surfaces"]._modules.values())
+    elements = tuple(modules["elements"]._modules.values())
+    phases = (surface.phase for surface in surfaces if surface.phase is not None)
+    tables = [modules[name]._modules for name in ("surfaces", "elements")]
+    for module in (modules["thicknesses"], *surfaces, *phases, *elements):
+        tables += (module._parameters, module._buffers, module._modules)
+    return _Places(
+        (lens._parameters, lens._modules, *filter(None, tables)),
+        tuple(table for table in tables if not table),
+        surfaces,
+        elements,
+    )
 
 
 def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:

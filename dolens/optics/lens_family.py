@@ -17,7 +17,7 @@ from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import IndexMap, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
-from dolens.optics.rays import TracedRays
+from dolens.optics.rays import Rays, TracedRays
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,27 @@ class FamilyRays:
     position: Tensor
     direction: Tensor
     wavelength: Tensor | None = None
+
+    def of_each(self, lenses: int) -> "FamilyRays":
+        """Return the rays of a single lens as those of each of many, which copies nothing."""
+        return replace(
+            self,
+            position=self.position.expand(lenses, -1, -1),
+            direction=self.direction.expand(lenses, -1, -1),
+        )
+
+
+def shared_rays(rays: Rays) -> tuple[tuple[float, ...], FamilyRays]:
+    """Return the wavelengths (nm) of rays that all lenses share, and the rays as those of a single
+    lens.
+
+    Args:
+        rays: N of them.
+    """
+    given = torch.as_tensor(rays.wavelength, dtype=torch.float64, device=rays.position.device)
+    waves, which = given.expand(rays.position.shape[:-1]).unique(return_inverse=True)
+    found = FamilyRays(rays.position[None], rays.direction[None], which.int())
+    return tuple(waves.tolist()), found
 
 
 @dataclass(frozen=True)
@@ -155,10 +176,15 @@ class LensFamily:
         parts = {n: values[s].reshape(self._shapes[n]) for n, s in self.columns.items()}
         return record_values(self.lens.system(parts))
 
-    def _map_at(
-        self, values: Tensor, variables: VariableMap | None
+    def map_at(
+        self, values: Tensor, variables: VariableMap | None = None
     ) -> tuple[VariableMap, Tensor | None]:
-        """Return the map of the variables, and its weights (L, E) where lenses have their own."""
+        """Return the map of the variables, and its weights (L, E) where lenses have their own.
+
+        Args:
+            values: (L, P).
+            variables: as in `jacobians`.
+        """
         given = variables or self.map
         if not self._has_poses:
             return given, None
@@ -167,7 +193,7 @@ class LensFamily:
         weights = derivatives[:, places, columns]
         return VariableMap(places, columns, weights[0], given.count, given.indices), weights
 
-    def _which(self, rays: FamilyRays) -> Tensor | None:
+    def wavelength_columns(self, rays: FamilyRays) -> Tensor | None:
         """Return each ray's column of the indices; None where there is but one wavelength."""
         if len(self.wavelengths) == 1:
             return None
@@ -199,7 +225,12 @@ class LensFamily:
         """
         table = self.table(values, indices)
         position, direction, path, status, surface = _Trace.apply(
-            table.values, table.indices, rays.position, rays.direction, self._which(rays), table
+            table.values,
+            table.indices,
+            rays.position,
+            rays.direction,
+            self.wavelength_columns(rays),
+            table,
         )
         return TracedRays(
             position=position,
@@ -231,7 +262,7 @@ class LensFamily:
             first = pack(system, self.wavelengths[0], 1.0, 1, surface, False)
             self._codes[surface] = first.codes
         table = replace(self.table(values, indices), codes=self._codes[surface])
-        given = (rays.position, rays.direction, self._which(rays))
+        given = (rays.position, rays.direction, self.wavelength_columns(rays))
         position, _, _, status, _ = kernels_of_lenses(rays.position).trace(table, given)
         return position[..., :2], status == 0
 
@@ -255,12 +286,12 @@ class LensFamily:
             variables: with indices among them, see `with_indices`; None: the family's own.
             index_derivatives: (L, E, wavelengths), of the indices with respect to these.
         """
-        own, weights = self._map_at(values, variables)
+        own, weights = self.map_at(values, variables)
         found = kernels_of_lenses(rays.position).ray_jacobians(
             self.table(values, indices),
             own,
             outputs,
-            (rays.position, rays.direction, self._which(rays)),
+            (rays.position, rays.direction, self.wavelength_columns(rays)),
             weights,
             index_derivatives,
         )
@@ -294,12 +325,12 @@ class LensFamily:
             variables: as in `jacobians`, and the last.
             index_derivatives: of the media.
         """
-        own, weights = self._map_at(values, variables)
+        own, weights = self.map_at(values, variables)
         head, jtr, jtj, sums = kernels_of_lenses(rays.position).normal_equations(
             self.table(values, indices),
             own,
             outputs,
-            (rays.position, rays.direction, self._which(rays)),
+            (rays.position, rays.direction, self.wavelength_columns(rays)),
             target,
             weight,
             group,

@@ -44,9 +44,8 @@ def trace_rays(
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
     reference = record or choose_backend(system, rays) == "reference"
-    finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
     ray = before = None
-    if reference or torch.promote_types(finer, system.dtype) != system.dtype:
+    if reference or _is_finer(rays, system.dtype):
         ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     if reference:
         assert ray is not None  # it entered above
@@ -110,6 +109,14 @@ def trace_components(
     return hit.components(), hit.valid
 
 
+def _is_finer(rays: Rays, dtype: torch.dtype) -> bool:
+    """Return whether rays have numbers that are lost in this precision."""
+    position, direction = rays.position.dtype, rays.direction.dtype
+    if position is direction is dtype:
+        return False
+    return torch.promote_types(torch.promote_types(position, direction), dtype) != dtype
+
+
 def _joined(
     system: OpticalSystem, rays: Rays, ray: Components | None, before: Tensor | None
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
@@ -118,13 +125,15 @@ def _joined(
         position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
         return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(ray.x.shape)
     shape = _shape(rays)
+    whole, like = (*shape, 3), system.sensor_distance
 
     def flat(vectors: Tensor) -> Tensor:
         """As the user gave them: a view of (..., 3), which a kernel reads in place."""
-        vectors = vectors.to(system.device, system.dtype)
-        if vectors.shape == (*shape, 3) and len(shape) == 1:
+        if vectors.dtype is not like.dtype or vectors.device != like.device:
+            vectors = vectors.to(like.device, like.dtype)
+        if vectors.ndim == 2 and vectors.shape == whole:
             return vectors
-        return vectors.expand(*shape, 3).reshape(-1, 3)
+        return vectors.expand(whole).reshape(-1, 3)
 
     return flat(rays.position), flat(rays.direction), shape
 

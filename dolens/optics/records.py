@@ -32,7 +32,8 @@ class Records:
         constants: (V,), float64.
         places: (E,), int64.
         sources: (E,), int64.
-        signs: (E,), float64.
+        signs: (E,), float64, each 1 or -1.
+        count: of the lens's numbers.
         codes: (steps, Code.ROW), int64; shared, not to be written to.
         extras: int64; likewise.
         media: places in `materials`, in the order of travel.
@@ -45,6 +46,7 @@ class Records:
     places: Tensor
     sources: Tensor
     signs: Tensor
+    count: int
     codes: Tensor
     extras: Tensor
     media: tuple[int, ...]
@@ -140,6 +142,7 @@ class _Writer:
             places=tensor(places, np.int64),
             sources=tensor(sources, np.int64),
             signs=tensor(signs, np.float64),
+            count=self.of_turns + 12 * len(self.turns),
             codes=tensor(self.codes, np.int64).reshape(-1, Code.ROW),
             extras=tensor([*self.extras, 0], np.int64),
             media=tuple(self.media),

@@ -14,7 +14,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
-from dolens.optics.lens_family import FamilyRays, LensFamily
+from dolens.optics.lens_family import LensFamily, shared_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
@@ -141,14 +141,9 @@ class _Moments:
 
     def _by_kernels(self, values: Tensor, rays: Rays) -> tuple[Components, Tensor, Tensor]:
         """Return the rays of every lens (K, N) on its sensor, and which failed and were clipped."""
-        given = torch.as_tensor(self.wavelength, dtype=torch.float64, device=values.device)
-        waves, which = given.expand(self.ray.x.shape).unique(return_inverse=True)
-        family = LensFamily(self.lens, self.names, waves.tolist())
-        shape = (len(values), *rays.position.shape)
-        hit = family.trace(
-            values,
-            FamilyRays(rays.position.expand(shape), rays.direction.expand(shape), which.int()),
-        )
+        wavelengths, shared = shared_rays(rays)
+        family = LensFamily(self.lens, self.names, wavelengths)
+        hit = family.trace(values, shared.of_each(len(values)))
         clipped = hit.status == int(Status.VIGNETTED)
         return hit.components(), ~(hit.valid | clipped), clipped
 

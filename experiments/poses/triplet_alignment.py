@@ -18,7 +18,8 @@ from dolens.alignment.element_fit import (
     most_likely_element,
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
-from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
+from dolens.alignment.spot_intercepts import one_thread
+from dolens.alignment.spot_moments import MomentModel, moment_model
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count, check_positive

@@ -1,6 +1,7 @@
 """SciPy's global optimizers on the merit function of a search, with its bounds and exact gradients.
 
-    python scripts/lens_search/scipy_on_merit.py search_triplet --stop 2 --seconds 60 --seeds 3
+    python scripts/lens_search/scipy_on_merit.py search_triplet --stop 2 --seconds 115 --seeds 3 \
+        --out FOLDER [--methods "differential evolution,random restarts"]
 
 The merit is that of the last stage: Σ of squared spots of all fields and squared deviations of the
 specification, weighted as the search does at its end.  Differential evolution has a population of
@@ -8,34 +9,29 @@ specification, weighted as the search does at its end.  Differential evolution h
 descend by L-BFGS-B with the merit's gradient, one lens at a time.  Each has so many seconds of
 processor time on one core, then its best is fitted once more by the search's own finish, so that a
 row says how good the basin is that was found.  A lens counts that keeps its operands to a
-thousandth.
+thousandth.  Runs that FOLDER has are not repeated.
 """
 
 import argparse
-import statistics
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import basinhopping, differential_evolution, dual_annealing, minimize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from search_parts import task
-
-from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.growth import settled
 from dolens.lens_search.merit import SearchMerit
+from lens_search.on_merit import Array, Run, Task, kept, table
 
-Array = NDArray[np.float64]
 # What a lens counts whose rays fail.
 _FAILED = 1.0
-_TOLERANCE = 1e-3
 
 
 class OutOfTimeError(Exception):
@@ -54,6 +50,14 @@ class Objective:
         self.merit, self.seconds = merit, seconds
         self.started, self.count = time.process_time(), 0
         self.best, self.where = np.inf, None
+
+    def start(self, random: np.random.Generator, bounds: list[tuple[float, float]]) -> Array:
+        """Return a random lens within the bounds; aspheres begin as paraboloids, since random
+        coefficients within theirs let no ray pass.
+        """
+        found = random.uniform(*np.array(bounds).T)
+        found[self.merit.arrangement.image_column + 1 :] = 0.0
+        return found
 
     def both(self, u: Array) -> tuple[Array, Array]:
         """Return values (L,) and gradients (L, P) of lenses u (L, P)."""
@@ -101,18 +105,18 @@ def annealing(of: Objective, bounds: list[tuple[float, float]], seed: int) -> No
 
 def hopping(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
     """Run SciPy's basin hopping from random lenses, a new one after thirty hops."""
-    random, ends = np.random.default_rng(seed), np.array(bounds)
+    random = np.random.default_rng(seed)
     local = {"method": "L-BFGS-B", "jac": True, "bounds": bounds}
     while True:
-        start = random.uniform(*ends.T)
+        start = of.start(random, bounds)
         basinhopping(of.one, start, niter=30, stepsize=0.1, minimizer_kwargs=local, rng=random)
 
 
 def restarts(of: Objective, bounds: list[tuple[float, float]], seed: int) -> None:
     """Descend from random lenses."""
-    random, ends = np.random.default_rng(seed), np.array(bounds)
+    random = np.random.default_rng(seed)
     while True:
-        minimize(of.one, random.uniform(*ends.T), jac=True, method="L-BFGS-B", bounds=bounds)
+        minimize(of.one, of.start(random, bounds), jac=True, method="L-BFGS-B", bounds=bounds)
 
 
 METHODS: dict[str, Method] = {
@@ -123,52 +127,37 @@ METHODS: dict[str, Method] = {
 }
 
 
-def _bounds(merit: SearchMerit, curved: float) -> list[tuple[float, float]]:
-    lower, upper = (end.clone() for end in merit.bounds())
-    surfaces = merit.arrangement.surfaces
-    lower[:surfaces], upper[:surfaces] = -curved, curved
-    return list(zip(lower.tolist(), upper.tolist(), strict=True))
-
-
 def main() -> None:
-    """Print the table."""
+    """Run what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("experiment")
     parser.add_argument("--stop", type=int, required=True, help="behind so many groups")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--methods", default=",".join(METHODS), help="names with commas")
     parser.add_argument("--curved", type=float, default=5.0, help="curvatures over 1/f at most")
+    parser.add_argument("--out", type=Path, required=True, help="folder of what is found")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    specification, plan = task(arguments.experiment)
-    arrangement = Arrangement.of(specification, arguments.stop)
-    merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
-    bounds = _bounds(merit, arguments.curved)
-    print("| method | runs | lenses | mean RMS spots of those that keep the limits, µm |")
-    print("|---|---|---|---|")
-    for name, method in METHODS.items():
-        spots, counts = [], []
-        for seed in range(arguments.seeds):
-            of = Objective(merit, arguments.seconds)
-            with suppress(OutOfTimeError):
-                method(of, bounds, seed)
-            counts.append(of.count)
-            spots.append(_finished(merit, of.where, plan.finish_rounds, plan.finish_iterations))
-        words = ", ".join("none" if spot is None else f"{spot:.4g}" for spot in spots)
-        print(f"| {name} | {len(spots)} | {statistics.median(counts):.2g} | {words} |", flush=True)
+    of = Task.of(arguments.experiment, arguments.stop)
+    bounds = of.bounds(arguments.curved)
+    for seed, name in product(range(arguments.seeds), arguments.methods.split(",")):
+        run = Run(arguments.experiment, name, seed, arguments.seconds, 0, None, None)
+        if not run.path(arguments.out).exists():
+            _searched(of, bounds, run).keep(arguments.out)
+    print(table(kept(arguments.out, arguments.experiment)), flush=True)
 
 
-def _finished(merit: SearchMerit, u: Array | None, rounds: int, iterations: int) -> float | None:
-    """Return the mean RMS spot, µm, of a lens after the search's own finish; None where it breaks
-    its specification.
-    """
-    if u is None:
-        return None
-    done = settled(merit, torch.from_numpy(u)[None], rounds, iterations)
-    deviations = done.merit.deviations(done.values, done.conditions)
-    broken = torch.where(done.merit.is_limit, deviations.clamp(min=0.0), deviations.abs()).amax()
-    spot = 1e3 * float(done.merit.spots(done.values, done.conditions).mean())
-    return spot if float(broken) < _TOLERANCE and np.isfinite(spot) else None
+def _searched(of: Task, bounds: list[tuple[float, float]], run: Run) -> Run:
+    """Return a run with what it found."""
+    middle = np.mean(bounds, axis=1)[None]
+    Objective(of.merit, np.inf).both(middle)  # compiles kernels: no part of the search
+    objective = Objective(of.merit, run.seconds)
+    with suppress(OutOfTimeError):
+        METHODS[run.method](objective, bounds, run.seed)
+    values = None if objective.where is None else objective.where.tolist()
+    spot = of.finished(objective.where)
+    return replace(run, lenses=objective.count, values=values, spot=spot)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,8 @@ def run(work, pieces, threads):
     """Spread a function of (job, first, end) in Python, which any thread may call."""
     driver = DRIVER(lambda job, first, end: work(job[0], first, end))
     jobs = [np.array([number], dtype=np.int64) for number in range(threads)]
-    spread(ctypes.cast(driver, ctypes.c_void_p).value, jobs, pieces)
+    addresses = [job.ctypes.data for job in jobs]
+    spread(ctypes.cast(driver, ctypes.c_void_p).value, addresses, pieces)
 
 
 def test_torchs_number_of_threads_is_obeyed(threads, team):

@@ -12,6 +12,7 @@ from torch.func import functional_call
 from dolens import Rays, load_lens
 from dolens.optics import ray_tracing
 from dolens.optics.surfaces.conic import Conic, Sphere
+from dolens.optics.surfaces.phase import Grating
 from dolens.prescriptions import lens_from_prescription
 
 WAVE = 587.5618
@@ -121,13 +122,17 @@ def change_precision(lens):
     change_data(lens)
 
 
+def rule_a_grating(lens):
+    lens.surfaces["6"].phase = Grating({"grooves": 2.0, "order": 1}, lens.dtype)
+
+
 def drop_reversals(lens):
     lens.fields = None
     change_data(lens)
 
 
 CHANGES = [exchange_parameter, exchange_surface, change_a_list_of_materials]
-CHANGES += [change_data, change_precision, drop_reversals]
+CHANGES += [change_data, change_precision, rule_a_grating, drop_reversals]
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -176,6 +181,36 @@ def test_numbers_kept_from_inference_mode_serve_training(root):
         lens.trace(rays)
     lens.trace(rays).path_length.sum().backward()
     assert lens.surfaces["1"].curvature.grad is not None
+
+
+def test_a_shallow_copy_with_tables_of_its_own_is_another_lens(root):
+    """Replicas of a module are made so: they share all else with it."""
+    lens, rays = triplet(root), bundle()
+    before = lens.trace(rays).position
+    other = copy.copy(lens)
+    other._parameters = dict(lens._parameters)
+    other.sensor_distance = torch.nn.Parameter(1.1 * lens.sensor_distance.detach())
+    assert (other.trace(rays).position - before).abs().max() > 1e-3
+    assert torch.equal(lens.trace(rays).position, before)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_number_has_its_own_derivative(root, dtype):
+    """Whatever the place in memory of the numbers, and which of them ask for one."""
+    lens, rays = triplet(root, dtype), bundle(dtype)
+    names = list(dict(lens.named_parameters()))
+    everyone = torch.autograd.grad(lens.trace(rays).position[:, 0].sum(), list(lens.parameters()))
+    together = torch.stack([p.detach() for p in lens.parameters()])
+    for number, parameter in zip(together, lens.parameters(), strict=True):
+        parameter.data = number
+    for name, expected in zip(names, everyone, strict=True):
+        lens.requires_grad_(False)
+        parameter = lens.get_parameter(name).requires_grad_()
+        lens.trace(rays).position[:, 0].sum().backward()
+        assert torch.equal(parameter.grad, expected)
+        others = (p.grad for n, p in lens.named_parameters() if n != name)
+        assert all(grad is None for grad in others)
+        parameter.grad = None
 
 
 class Bent(Sphere):

@@ -1,6 +1,7 @@
 """These functions run the CPU kernels on tensors."""
 
-import numpy as np
+from collections.abc import MutableMapping
+
 import torch
 from torch import Tensor
 
@@ -8,17 +9,24 @@ from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.layout import BLOCK
-from dolens.kernels.cpu.program import REAL, Program
-from dolens.kernels.cpu.stored_numbers import read as read
+from dolens.kernels.cpu.program import Frame, Program, frame_of
+from dolens.kernels.cpu.stored_numbers import StoredNumbers as StoredNumbers
 from dolens.kernels.table import SurfaceTable
 
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
 _RAY_GRADIENTS = (jobs.POSITION_GRADIENT, jobs.DIRECTION_GRADIENT)
 
+# Of programs of the same codes, extras and precision, without and with derivatives.
+Frames = MutableMapping[bool, Frame]
+
 
 def trace(
-    table: SurfaceTable, position: Tensor, direction: Tensor, which: Tensor | None
+    table: SurfaceTable,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    frames: Frames | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Carry rays through every step.
 
@@ -27,6 +35,7 @@ def trace(
         position: (N, 3), mm, in the table's precision.
         direction: (N, 3), unit vectors.
         which: (N,), int32, each ray's column of `table.indices`, or None for the first.
+        frames: where those of the table are kept.
 
     Returns:
         position (N, 3), direction (N, 3), path length (N,), mm; status (N,), int8; and the surface
@@ -42,7 +51,7 @@ def trace(
     )
     if count == 0:
         return out
-    program = Program(table, derivatives=False)
+    program = Program(table, derivatives=False, frame=_frame(table, False, frames))
     program.set_rays(position, direction, which)
     # Position, direction, path, status and surface: neighbours in a job.
     program.job[jobs.OUT_POSITION : jobs.OUT_SURFACE + 1] = [tensor.data_ptr() for tensor in out]
@@ -70,11 +79,13 @@ def trace_adjoint(
         Gradients of position and direction (None where not wanted), of `values` and of `indices`
         (zeros where not wanted).
     """
-    *of_rays, of_values, of_indices = sweep(
+    of_position, of_direction, sums = sweep(
         table, position, direction, which, status, cotangents, wanted
     )
-    values, indices = torch.from_numpy(of_values.copy()), torch.from_numpy(of_indices.copy())
-    return of_rays[0], of_rays[1], values, indices
+    cut = table.values.numel()
+    of_values = sums[:cut].to(table.values.dtype, copy=True)
+    of_indices = sums[cut:].reshape(table.indices.shape).clone()
+    return of_position, of_direction, of_values, of_indices
 
 
 def sweep(
@@ -85,7 +96,8 @@ def sweep(
     status: Tensor,
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
     wanted: tuple[bool, bool, bool],
-) -> tuple[Tensor | None, Tensor | None, np.ndarray, np.ndarray]:
+    frames: Frames | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor]:
     """Return the cotangents of rays and table from those of position, direction and path length.
 
     Args:
@@ -96,28 +108,29 @@ def sweep(
         status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
         cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
         wanted: whether gradients of position, direction and indices are needed.
+        frames: where those of the table are kept.
 
     Returns:
-        Gradients of position and direction (None where not wanted), and arrays of those of
-        `values` and of `indices` (zeros where not wanted), which may share memory.
+        Gradients of position and direction (None where not wanted), and in one tensor those of
+        `values` and then of `indices` (zeros where not wanted), float64.
     """
     count = position.shape[0]
     gradients = [
         torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted[:2]
     ]
-    cut = table.values.numel()
-    length = cut + table.indices.numel()
+    length = table.values.numel() + table.indices.numel()
     chunk = chunk_size(count)
     chunks = -(-count // chunk)
-    sums = np.zeros((chunks, length))
+    sums = torch.zeros(length if chunks == 1 else (chunks, length), dtype=torch.float64)
     if count:
-        program = Program(table, derivatives=True)
+        program = Program(table, derivatives=True, frame=_frame(table, True, frames))
         program.set_rays(position, direction, which)
         job = program.job
-        job[jobs.OUT_STATUS], job[jobs.SUMS] = status.data_ptr(), sums.ctypes.data
+        job[jobs.OUT_STATUS] = status.data_ptr()
         for place, gradient in zip(_RAY_GRADIENTS, gradients, strict=True):
-            job[place] = 0 if gradient is None else gradient.data_ptr()
-        job[jobs.SUM_LENGTH], job[jobs.CHUNK] = length, chunk
+            if gradient is not None:
+                job[place] = gradient.data_ptr()
+        job[jobs.SUMS], job[jobs.SUM_LENGTH], job[jobs.CHUNK] = sums.data_ptr(), length, chunk
         job[jobs.INDEX_SUMS] = int(wanted[2])
         of_position, of_direction, of_path = cotangents
         for place, tensor in (
@@ -130,6 +143,14 @@ def sweep(
                 job[place + 1 : place + 1 + tensor.dim()] = tensor.stride()
         program.run(adjoint_driver, chunks)
     # PyTorch's sum, which adds pairwise.
-    total = sums[0] if chunks == 1 else torch.from_numpy(sums).sum(0).numpy()
-    of_values = total[:cut].astype(REAL[table.values.dtype], copy=False)
-    return gradients[0], gradients[1], of_values, total[cut:].reshape(table.indices.shape)
+    return gradients[0], gradients[1], sums if chunks == 1 else sums.sum(0)
+
+
+def _frame(table: SurfaceTable, derivatives: bool, frames: Frames | None) -> Frame:
+    """Return the frame of a table's programs, and keep it if there is where."""
+    frame = None if frames is None else frames.get(derivatives)
+    if frame is None:
+        frame = frame_of(table, derivatives)
+        if frames is not None:
+            frames[derivatives] = frame
+    return frame

@@ -188,5 +188,6 @@ def bounded_steps(
     memories = [scratch(8 * size * (size + 3), worker) for worker in range(threads)]
     shared = [*(t.data_ptr() for t in given), step.data_ptr(), size]
     own = [np.array([*shared, memory.address], dtype=np.int64) for memory in memories]
-    spread(compiler.compile_driver(steps_driver, "float64"), own, problems)
+    driver = compiler.compile_driver(steps_driver, "float64")
+    spread(driver, [job.ctypes.data for job in own], problems)
     return step

@@ -31,4 +31,4 @@ INDEX_ENTRIES, INDEX_ROWS, INDEX_COLUMNS, INDEX_WEIGHTS = range(66, 70)
 # Of many lenses: the driver of one, the pieces of one, and how far the address at a place moves on
 # from one lens to the next: pairs of place and bytes, and how many pairs.
 INNER_DRIVER, INNER_PIECES, STRIDES, STRIDE_PAIRS = range(70, 74)
-LENGTH = 80  # of a job
+LENGTH = 80  # of a job: whole lines of the cache

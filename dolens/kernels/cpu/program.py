@@ -41,7 +41,7 @@ from dolens.kernels.cpu.records import (
     STARTS_ON_CONIC,
     STENCIL,
 )
-from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
 from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
@@ -119,22 +119,18 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     return Steps(rows, longest, scratch, address)
 
 
-class _Frame(NamedTuple):
+class Frame(NamedTuple):
     """What programs of the same steps have in common.
 
     Attributes:
         codes: of `Steps`, with the address of each step's extras; not to be written to.
-        address: of the codes.
-        clip: as in `Steps`.
-        cotangents: numbers of a set of cotangents.
-        memory: bytes of a worker.
+        job: a program's, but for the addresses of its table and rays; likewise.
+        memory: bytes of a worker: its job first.
         parts: of the memory: the place of each in a job, and where it begins, bytes.
     """
 
     codes: np.ndarray
-    address: int
-    clip: int
-    cotangents: int
+    job: np.ndarray
     memory: int
     parts: tuple[tuple[int, int], ...]
 
@@ -142,7 +138,7 @@ class _Frame(NamedTuple):
 @lru_cache(maxsize=256)
 def _frame(
     key: tuple[bytes, str, bool], extras: int, outputs: int, columns: int, size: int
-) -> _Frame:
+) -> Frame:
     """Return the frame of programs.
 
     Args:
@@ -155,10 +151,14 @@ def _frame(
     steps, derivatives = _steps(*key), key[2]
     codes = steps.codes.copy()
     codes[:, EXTRAS_ADDRESS] = extras + 8 * codes[:, Code.EXTRAS]
+    job = np.zeros(jobs.LENGTH, dtype=np.int64)
+    job[jobs.STEPS], job[jobs.CODES] = len(key[0]) // (8 * Code.ROW), codes.ctypes.data
+    job[jobs.CLIP] = steps.clip
     # All of them with derivatives, else two in turn; and some that a driver may keep.
-    states = len(key[0]) // (8 * Code.ROW) + 3 if derivatives else 5
+    states = int(job[jobs.STEPS]) + 3 if derivatives else 5
     cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
-    parts, end = [], 0
+    job[jobs.COTANGENT_LENGTH] = cotangents
+    parts, end = [], job.nbytes
     for place, length in (
         (jobs.STACK, states * STATE * size),
         (jobs.COTANGENTS, outputs * cotangents * size),
@@ -169,7 +169,14 @@ def _frame(
     ):
         parts.append((place, end))
         end += length
-    return _Frame(codes, codes.ctypes.data, steps.clip, cotangents, end, tuple(parts))
+    return Frame(codes, job, end, tuple(parts))
+
+
+def frame_of(table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0) -> Frame:
+    """Return the frame of a table's programs; the arguments are `Program`'s."""
+    values, extras = table.values, table.extras
+    key = (table.codes.numpy().tobytes(), REAL[values.dtype], derivatives)
+    return _frame(key, extras.data_ptr(), outputs, columns, values.itemsize)
 
 
 def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
@@ -201,32 +208,33 @@ class Program:
         derivatives: whether cotangents will be swept back.
         outputs: sets of cotangents that a block holds.
         columns: further rows of a block that a driver asks for.
+        frame: that of such programs, where it is known.
     """
 
     def __init__(
-        self, table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0
+        self,
+        table: SurfaceTable,
+        derivatives: bool,
+        outputs: int = 1,
+        columns: int = 0,
+        frame: Frame | None = None,
     ) -> None:
-        self.real = REAL[table.values.dtype]
-        self.table = table
-        self.derivatives = derivatives
-        key = (table.codes.numpy().tobytes(), self.real, derivatives)
-        values, size = table.values.data_ptr(), table.values.element_size()
-        frame = _frame(key, table.extras.data_ptr(), outputs, columns, size)
-        length = table.values.numel()
-        self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
+        values, indices = table.values, table.indices
+        self.table = table  # held, as are its numbers
+        self.real = REAL[values.dtype]
+        if frame is None:
+            frame = frame_of(table, derivatives, outputs, columns)
+        self._frame = frame
+        begin, length = values.data_ptr(), values.numel()
+        self.job = frame.job.copy()
         # Neighbours in a job.
-        self.job[jobs.STEPS : jobs.CLIP + 1] = (
-            table.codes.shape[0],
-            frame.address,
-            values,
-            table.indices.data_ptr(),
-            table.indices.shape[1],
-            values + (length - 1) * size,  # the last number, added to z
-            frame.clip,
+        self.job[jobs.VALUES : jobs.EXIT_Z + 1] = (
+            begin,
+            indices.data_ptr(),
+            indices.shape[1],
+            begin + (length - 1) * values.itemsize,  # the last number, added to z
         )
         self.job[jobs.VALUES_LENGTH] = length
-        self.job[jobs.COTANGENT_LENGTH] = frame.cotangents
-        self._frame = frame
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
         """Point to rays (N, 3) of any strides, and to their wavelengths' columns (N,), int32."""
@@ -261,11 +269,12 @@ class Program:
         threads = min(thread_count(int(self.job[jobs.RAYS]) * lenses, small), pieces)
         # Memories are held until the last share is done.
         memories = [scratch(self._frame.memory, worker) for worker in range(threads)]
-        spread(function, [self._job_of(memory.address) for memory in memories], pieces)
+        spread(function, [self._job_in(memory) for memory in memories], pieces)
 
-    def _job_of(self, memory: int) -> np.ndarray:
-        """Return the job of a worker with the memory at this address."""
-        job = self.job.copy()
+    def _job_in(self, memory: Memory) -> int:
+        """Write the job of a worker with this memory into it, and return its address."""
+        job = memory.held[: jobs.LENGTH]
+        job[:] = self.job
         for place, begin in self._frame.parts:
-            job[place] = memory + begin
-        return job
+            job[place] = memory.address + begin
+        return memory.address

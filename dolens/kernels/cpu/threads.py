@@ -50,7 +50,7 @@ class Memory(NamedTuple):
     Attributes:
         size: bytes from `address` on.
         address: of a line of the cache.
-        held: what holds it.
+        held: it, as integers of 8 bytes.
     """
 
     size: int
@@ -67,28 +67,30 @@ def scratch(size: int, worker: int) -> Memory:
     kept = _own.__dict__.setdefault("memory", {})
     memory = kept.get(worker)
     if memory is None or memory.size < size:
-        held = np.empty(size + _LINE, dtype=np.uint8)
-        memory = Memory(size, -(-held.ctypes.data // _LINE) * _LINE, held)
+        length, line = -(-size // 8), _LINE // 8
+        held = np.empty(length + line, dtype=np.int64)
+        held = held[-held.ctypes.data % _LINE // 8 :][:length]
+        memory = Memory(size, held.ctypes.data, held)
         if size <= _KEPT:
             kept[worker] = memory
     return memory
 
 
-def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
+def spread(driver: int, jobs: Sequence[int], pieces: int) -> None:
     """Run all pieces on as many threads as there are jobs.
 
     Args:
         driver: address of a C function of (job, first, end) that runs these pieces; it keeps
             whatever it writes for itself in its job.
-        jobs: int64 arrays, one for each thread.
+        jobs: addresses of arrays of int64, one for each thread.
         pieces: how many.
     """
     threads = min(len(jobs), pieces)
     if threads == 1:
-        function_at(driver)(jobs[0].ctypes.data, 0, pieces)
+        function_at(driver)(jobs[0], 0, pieces)
         return
     bounds = _shares(pieces, threads)
-    addresses = np.array([job.ctypes.data for job in jobs], dtype=np.int64)
+    addresses = np.array(jobs, dtype=np.int64)
     task = np.zeros(team.TASK, dtype=np.int64)
     task[team.SHARES], task[team.DRIVER] = len(bounds), driver
     task[team.BOUNDS], task[team.JOBS] = bounds.ctypes.data, addresses.ctypes.data

@@ -52,4 +52,4 @@ def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.n
 def _run(driver: compiler.Factory, job: np.ndarray, chunks: int, like: Tensor) -> None:
     function = compiler.compile_driver(driver, REAL[like.dtype])
     # Threads may share a job: it holds no memory to work in.
-    spread(function, [job] * thread_count(like.numel()), chunks)
+    spread(function, [job.ctypes.data] * thread_count(like.numel()), chunks)
