@@ -83,7 +83,7 @@ class NAFNet(nn.Module):
             nn.Conv2d(c, 2 * c, kernel_size=2, stride=2) for c in widths[:-1]
         )
         self.middle = blocks(middle, widths[-1])
-        self.double = nn.ModuleList(
+        self.lift = nn.ModuleList(
             nn.Conv2d(c, 2 * c, kernel_size=1, bias=False) for c in widths[:0:-1]
         )
         self.up = nn.ModuleList(blocks(n, c) for n, c in zip(up, widths[-2::-1], strict=True))
@@ -108,8 +108,8 @@ class NAFNet(nn.Module):
             skips.append(features)
             features = halve(features)
         features = self.middle(features)
-        for double, blocks in zip(self.double, self.up, strict=True):
-            features = blocks(functional.pixel_shuffle(double(features), 2) + skips.pop())
+        for lift, blocks in zip(self.lift, self.up, strict=True):
+            features = blocks(functional.pixel_shuffle(lift(features), 2) + skips.pop())
         return functional.pixel_shuffle(self.output(features), self.fold)[..., :height, :width]
 
 

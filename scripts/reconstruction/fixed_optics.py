@@ -1,6 +1,7 @@
 """Images of one lens that does not change, made once, so that networks alone are compared."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from omegaconf import DictConfig
 from torch import Tensor
 
 from dolens.experiments.camera.base import Camera
@@ -15,6 +17,7 @@ from dolens.experiments.camera.views.base import seed_of
 from dolens.experiments.data.camera_data import CropDataModule
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
+from dolens.reconstruction import Restoration
 from dolens.scene.planar import pinhole_image
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
@@ -70,9 +73,7 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
             are made.
         training: whether training and validation images are made too, or test images alone.
     """
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("train", list(overrides), return_hydra_config=True)
-        HydraConfig.instance().set_config(cfg)
+    with _composed(overrides) as cfg:
         camera = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
         data = instantiate(cfg.data)
     if not file.is_file():
@@ -85,6 +86,20 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
     kept = torch.load(file, weights_only=True)
     splits = {name: Split(**tensors) for name, tensors in kept["splits"].items()}
     return FixedOptics(kept["functions"], camera.views.readout, splits, data.batch_size)
+
+
+def composed_network(overrides: Sequence[str]) -> Restoration:
+    """Return the network that `train.py` would make, of new weights."""
+    with _composed(overrides) as cfg:
+        return instantiate(cfg.network)
+
+
+@contextmanager
+def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("train", list(overrides), return_hydra_config=True)
+        HydraConfig.instance().set_config(cfg)
+        yield cfg
 
 
 def _made(camera: Camera, data: CropDataModule, split: str) -> Split:

@@ -13,11 +13,13 @@ from scripts.reconstruction.fixed_optics import FixedOptics, Split
 
 _VIEW_NORM = 4.0  # as conf/wavefront_camera.yaml
 _BETAS = (0.9, 0.99)  # as conf/optimizer/camera.yaml
+_RATE = 0.002  # as conf/wavefront_camera.yaml
 _TEST_SEED = 10**6
+_TIMED = 3  # steps whose time tells how many are possible
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedFor:
     """A network that was trained.
 
     Attributes:
@@ -31,39 +33,67 @@ class Trained:
     steps: int
 
 
-def train(
-    make: Callable[[], Restoration],
-    optics: FixedOptics,
-    steps: int,
-    seed: int,
-    learning_rate: float = 0.002,
-) -> Trained:
-    """Train a network as the camera experiment does, but for the lens, which stays.
+def train_for(
+    make: Callable[[], Restoration], optics: FixedOptics, limit: float, seed: int
+) -> TrainedFor:
+    """Train a network for so much process time as the camera experiment does, but for the lens.
 
     The seed decides its first weights, the order of the crops and the noise.  The learning rate
-    falls to zero along a cosine.
+    falls to zero along a cosine, over as many steps as the time is enough for by the first ones.
+
+    Args:
+        make: the network.
+        optics: images that it is trained on.
+        limit: process time, seconds.
+        seed: of all random numbers.
     """
     torch.manual_seed(seed)
-    network = make().train()
-    loss = RestorationLoss(perceptual="none")
-    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, betas=_BETAS)
-    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=steps)
-    order = _order(len(optics.splits["train"].images), steps * optics.batch, seed)
-    seconds = 0.0
-    for step in range(steps):
-        chosen = order[step * optics.batch : (step + 1) * optics.batch]
-        images = optics.splits["train"].images[chosen]
-        truth = optics.splits["train"].truth[chosen].float()
-        raw = optics.raw(images, seed * 100_000 + step)
-        started = time.process_time()
-        restored = network(raw.flatten(0, 1), optics.functions, None).unflatten(0, raw.shape[:2])
-        total = loss_over_views(loss, restored, truth[:, None].expand_as(raw), _VIEW_NORM)["total"]
-        optimizer.zero_grad()
-        total.backward()
-        optimizer.step()
+    trial = _Training(make().train(), optics, seed)
+    trial.step(0)
+    seconds = sum(trial.step(number) for number in range(_TIMED)) / _TIMED
+    steps = max(1, round(limit / seconds))
+    torch.manual_seed(seed)
+    training = _Training(make().train(), optics, seed)
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(training.optimizer, T_max=steps)
+    taken = 0.0
+    for number in range(steps):
+        taken += training.step(number)
         scheduler.step()
-        seconds += time.process_time() - started
-    return Trained(network.eval(), seconds, steps)
+    return TrainedFor(training.network.eval(), taken, steps)
+
+
+class _Training:
+    """A network, its optimizer, and the images that it sees."""
+
+    def __init__(self, network: Restoration, optics: FixedOptics, seed: int) -> None:
+        self.network, self.optics, self.seed = network, optics, seed
+        self.loss = RestorationLoss(perceptual="none")
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=_RATE, betas=_BETAS)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.order: list[int] = []
+
+    def step(self, number: int) -> float:
+        """Take a step, and return its process time in seconds; noise and images do not count."""
+        train = self.optics.splits["train"]
+        chosen = torch.tensor([self._next() for _ in range(self.optics.batch)])
+        truth = train.truth[chosen].float()
+        raw = self.optics.raw(train.images[chosen], self.seed * 100_000 + number)
+        started = time.process_time()
+        found = self.network(raw.flatten(0, 1), self.optics.functions, None)
+        found = found.unflatten(0, raw.shape[:2])
+        truth = truth[:, None].expand_as(found)
+        total = loss_over_views(self.loss, found, truth, _VIEW_NORM)["total"]
+        self.optimizer.zero_grad()
+        total.backward()
+        self.optimizer.step()
+        return time.process_time() - started
+
+    def _next(self) -> int:
+        # All crops before any comes again.
+        if not self.order:
+            count = len(self.optics.splits["train"].images)
+            self.order = torch.randperm(count, generator=self.generator).tolist()
+        return self.order.pop()
 
 
 @torch.no_grad()
@@ -94,10 +124,3 @@ def _pair(network: Restoration, optics: FixedOptics, split: Split, n: int) -> tu
     raw = optics.raw(split.images[n], _TEST_SEED + n)
     found = network(raw, optics.functions, None).clamp(0.0, 1.0)
     return found, split.truth[n].float().expand_as(found)
-
-
-def _order(count: int, needed: int, seed: int) -> Tensor:
-    """Return numbers of crops, all of them before any comes again."""
-    generator = torch.Generator().manual_seed(seed)
-    rounds = -(-needed // count)
-    return torch.cat([torch.randperm(count, generator=generator) for _ in range(rounds)])[:needed]

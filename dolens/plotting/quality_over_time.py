@@ -1,0 +1,52 @@
+"""Image quality is plotted against seconds of training, for each network."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from dolens.plotting.legends import legend_below
+from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
+from dolens.plotting.titles import draw_title
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A `Curve` holds the quality of one network.
+
+    Attributes:
+        label: of the network.
+        seconds: of training, ascending.
+        quality: PSNR in dB at each of them.
+    """
+
+    label: str
+    seconds: Sequence[float]
+    quality: Sequence[float]
+
+
+def quality_figure(
+    found: Sequence[Curve], title: str | None = "Quality against seconds of training"
+) -> Figure:
+    """Plot PSNR at the worst depth against process time of training, on a logarithmic axis.
+
+    Args:
+        found: one or more.
+        title: above all.
+    """
+    figure = Figure(figsize=(PAGE * 0.8, 3.8), layout="constrained")
+    axes = figure.subplots()
+    handles = []
+    for curve, colour, marker in zip(found, colours(len(found)), _MARKERS, strict=False):
+        (line,) = axes.plot(curve.seconds, curve.quality, color=colour, marker=marker)
+        handles.append(line)
+    axes.set_xscale("log")
+    axes.set_xlabel("seconds of training, one processor", fontsize=SMALL)
+    axes.set_ylabel("PSNR at the worst depth (dB)", fontsize=SMALL)
+    ruled_axes(axes)
+    legend_below(figure, handles, 3, [curve.label for curve in found])
+    draw_title(figure, title)
+    return figure
+
+
+_MARKERS = "osD^v<>Px*" * 2
