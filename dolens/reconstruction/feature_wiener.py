@@ -163,18 +163,25 @@ class LearnedFeatures(nn.Module):
 
     def forward(self, raw: Tensor, functions: Tensor) -> Tensor:
         """Return (B, features·scales, H, W) of images (B, 3, H, W) and functions (D, 3, K, K)."""
-        check_functions(functions)
         height, width = raw.shape[-2:]
+        filters, columns = self.filters(functions, height, width)
+        rows = filters.shape[-2]
+        spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
+        found = torch.einsum("fcuv,bcuv->bfuv", filters, spectrum)
+        return torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
+
+    def filters(self, functions: Tensor, height: int, width: int) -> tuple[Tensor, int]:
+        """Return filters (features·scales, 3, R, C // 2 + 1), complex, to a feature from a colour,
+        and C; see `OpponentWiener.filters`.
+        """
+        check_functions(functions)
         size = max(functions.shape[-1], max(self.spacings) * (_KERNEL - 1) + 1)
         rows, columns = padded_lengths(height, width, self.margin, size)
         matched, power = correlations(functions, rows, columns)
         ratio = self.log_noise_to_signal.exp()[:, None, None, None]
-        prior = squared_frequency(rows, columns, raw) * ratio
-        weight = matched / (power + prior).clamp(min=torch.finfo(raw.dtype).eps)
-        spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
-        filters = weight * self._kernel_transforms(rows, columns)
-        found = torch.einsum("fcuv,bcuv->bfuv", filters, spectrum)
-        return torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
+        prior = squared_frequency(rows, columns, power) * ratio
+        weight = matched / (power + prior).clamp(min=torch.finfo(power.dtype).eps)
+        return weight * self._kernel_transforms(rows, columns), columns
 
     def _kernel_transforms(self, rows: int, columns: int) -> Tensor:
         found = []

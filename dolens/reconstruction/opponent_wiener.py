@@ -112,10 +112,28 @@ class OpponentWiener(nn.Module):
                 "a network with a Wiener deconvolution needs the lens's point spread functions, "
                 "got None: use a renderer that gives them, or a network that works without, as unet"
             )
-        check_functions(functions, self.depths or None)
-        functions = functions.to(image)
-        ratios = self.log_noise_to_signal.exp()
         height, width = image.shape[-2:]
+        filters, columns = self.filters(functions.to(image), height, width)
+        rows = filters.shape[-2]
+        spectrum = torch.fft.rfft2(close_periodically(image, rows, columns))
+        found = torch.einsum("ncduv,bduv->bncuv", filters, spectrum)
+        return torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
+
+    def filters(self, functions: Tensor, height: int, width: int) -> tuple[Tensor, int]:
+        """Return filters (1 + depths, 3, 3, R, C // 2 + 1), complex, to a colour from a colour, and
+        C.
+
+        Args:
+            functions: point spread functions, (D, 3, K, K), K odd; one stands for all depths.
+            height: of the images, pixels.
+            width: of the images, pixels.
+
+        Raises:
+            InputError: `functions` of another shape.
+        """
+        if self.depths and len(functions) == 1:
+            functions = functions.expand(self.depths, *functions.shape[1:])
+        check_functions(functions, self.depths or None)
         rows, columns = padded_lengths(height, width, self.margin, functions.shape[-1])
         matched, power = correlations(functions, rows, columns)
         matched, power = matched[None], power[None]
@@ -123,10 +141,12 @@ class OpponentWiener(nn.Module):
             each = [correlations(one[None], rows, columns) for one in functions]
             matched = torch.cat([matched, torch.stack([own for own, _ in each])])
             power = torch.cat([power, torch.stack([own for _, own in each])])
-        spectrum = torch.fft.rfft2(close_periodically(image, rows, columns))[:, None]
-        frequency = squared_frequency(rows, columns, image)
-        solved = solve_in_opponent_colours(power, frequency, ratios, matched * spectrum)
-        return torch.fft.irfft2(solved, s=(rows, columns))[..., :height, :width]
+        # From each colour alone: (from, 1 + depths, to, R, C // 2 + 1).
+        colours = torch.eye(3, dtype=power.dtype, device=power.device)[:, None, :, None, None]
+        frequency = squared_frequency(rows, columns, power)
+        ratios = self.log_noise_to_signal.exp()
+        solved = solve_in_opponent_colours(power, frequency, ratios, colours * matched)
+        return solved.permute(1, 2, 0, 3, 4), columns
 
 
 def check_functions(functions: Tensor, depths: int | None = None) -> None:
@@ -206,8 +226,9 @@ def solve_in_opponent_colours(
     return torch.stack(_times(basis.T, solved), dim=-3)
 
 
-def _times(matrix: Tensor, colours: tuple[Tensor, ...]) -> list[Tensor]:
-    return [sum((w * c for w, c in zip(row, colours, strict=True)), 0.0) for row in matrix]
+def _times(matrix: Tensor, colours: Sequence[Tensor]) -> list[Tensor]:
+    first, second, third = colours
+    return [a * first + b * second + c * third for a, b, c in matrix]
 
 
 def _inverse(matrix: Symmetric) -> Symmetric:
