@@ -18,17 +18,21 @@ class Curve:
         label: of the network.
         seconds: of training, ascending.
         quality: PSNR in dB at each of them.
+        low: lower ends of its intervals, dB.
+        high: upper ends.
     """
 
     label: str
     seconds: Sequence[float]
     quality: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
 
 
 def quality_figure(
     found: Sequence[Curve], title: str | None = "Quality against seconds of training"
 ) -> Figure:
-    """Plot PSNR at the worst depth against process time of training, on a logarithmic axis.
+    """Plot PSNR at the worst depth against process time of training, with bars for intervals.
 
     Args:
         found: one or more.
@@ -38,9 +42,20 @@ def quality_figure(
     axes = figure.subplots()
     handles = []
     for curve, colour, marker in zip(found, colours(len(found)), _MARKERS, strict=False):
-        (line,) = axes.plot(curve.seconds, curve.quality, color=colour, marker=marker)
-        handles.append(line)
-    axes.set_xscale("log")
+        below = [q - low for q, low in zip(curve.quality, curve.low, strict=True)]
+        above = [high - q for q, high in zip(curve.quality, curve.high, strict=True)]
+        # Side by side, as all have trained for the same seconds.
+        seconds = [s * (1.0 + 0.015 * len(handles)) for s in curve.seconds]
+        bars = axes.errorbar(
+            seconds,
+            curve.quality,
+            (below, above),
+            color=colour,
+            marker=marker,
+            elinewidth=0.6,
+        )
+        handles.append(bars)
+    axes.set_xlim(left=0.0)
     axes.set_xlabel("seconds of training, one processor", fontsize=SMALL)
     axes.set_ylabel("PSNR at the worst depth (dB)", fontsize=SMALL)
     ruled_axes(axes)

@@ -89,6 +89,8 @@ def curves(results: Sequence[Result]) -> list[Curve]:
             name,
             [limit for limit, _ in points],
             [i.estimate for _, i in points],
+            [i.low for _, i in points],
+            [i.high for _, i in points],
         )
         for name, points in found.items()
     ]

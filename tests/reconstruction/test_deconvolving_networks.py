@@ -1,4 +1,4 @@
-"""Networks behind a deconvolution of opponent colours begin as it; NAFNets begin as the identity."""
+"""Networks behind a deconvolution of opponent colours begin as it, NAFNets as the identity."""
 
 import pytest
 import torch
