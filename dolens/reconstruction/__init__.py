@@ -10,6 +10,7 @@ from dolens.reconstruction.adversarial import (
 from dolens.reconstruction.backbones import Backbone, load_backbone
 from dolens.reconstruction.discriminators import GlobalDiscriminator, PatchDiscriminator
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
+from dolens.reconstruction.feature_wiener import FeatureWienerRestoration
 from dolens.reconstruction.field_coordinates import field_channels
 from dolens.reconstruction.losses import (
     RestorationLoss,
@@ -17,6 +18,9 @@ from dolens.reconstruction.losses import (
     mean_squared_error,
     total_variation,
 )
+from dolens.reconstruction.nafnet import NAFNet
+from dolens.reconstruction.nafnet_restoration import NAFNetRestoration, WienerNAFNetRestoration
+from dolens.reconstruction.opponent_wiener import opponent_wiener_deconvolve
 from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.quality import psnr_db, structural_similarity
 from dolens.reconstruction.restoration import (
@@ -27,13 +31,17 @@ from dolens.reconstruction.restoration import (
 )
 from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 from dolens.reconstruction.unet import UNet
+from dolens.reconstruction.unrolled_splitting import UnrolledSplittingRestoration
 from dolens.reconstruction.wiener import wiener_deconvolve
 
 __all__ = [
     "Backbone",
     "FeaturePyramid",
     "FeaturePyramidRestoration",
+    "FeatureWienerRestoration",
     "GlobalDiscriminator",
+    "NAFNet",
+    "NAFNetRestoration",
     "PatchDiscriminator",
     "PretrainedWeightsUnavailable",
     "RelativisticDiscriminators",
@@ -41,13 +49,16 @@ __all__ = [
     "RestorationLoss",
     "UNet",
     "UNetRestoration",
+    "UnrolledSplittingRestoration",
     "VGG16Features",
+    "WienerNAFNetRestoration",
     "WienerUNetRestoration",
     "field_channels",
     "load_backbone",
     "load_vgg16_weights",
     "mean_absolute_error",
     "mean_squared_error",
+    "opponent_wiener_deconvolve",
     "perceptual_loss",
     "psnr_db",
     "relativistic_discriminator_loss",

@@ -86,8 +86,8 @@ def wiener_filter(
     """
     like = point_spread_function
     ratio = torch.as_tensor(noise_to_signal, dtype=like.dtype, device=like.device)
-    transfer = _transfer_function(point_spread_function, rows, columns)
-    prior = _squared_frequency(rows, columns, like) * ratio.reshape(-1, 1, 1)
+    transfer = transfer_function(point_spread_function, rows, columns)
+    prior = squared_frequency(rows, columns, like) * ratio.reshape(-1, 1, 1)
     power = transfer.real**2 + transfer.imag**2
     # A floor and not a sum, so that the gain at f = 0 stays exact.
     return transfer.conj() / (power + prior).clamp(min=torch.finfo(like.dtype).eps)
@@ -105,7 +105,14 @@ def _check(channels: int, point_spread_function: Tensor, margin: int) -> None:
         raise ValueError(f"margin={margin}: must be at least 0 pixels")
 
 
-def _transfer_function(point_spread_function: Tensor, rows: int, columns: int) -> Tensor:
+def transfer_function(point_spread_function: Tensor, rows: int, columns: int) -> Tensor:
+    """Return H(f) on the grid of `torch.fft.rfft2`, (..., rows, columns//2 + 1), complex.
+
+    Args:
+        point_spread_function: (..., K, K), K odd, whose pixel (K//2, K//2) is the origin.
+        rows: of the padded image, at least K.
+        columns: of the padded image, at least K.
+    """
     size = point_spread_function.shape[-1]
     padded = functional.pad(point_spread_function, (0, columns - size, 0, rows - size))
     # The centre goes to the origin, the part before it wraps to the far end.
@@ -113,8 +120,10 @@ def _transfer_function(point_spread_function: Tensor, rows: int, columns: int) -
     return torch.fft.rfft2(centred)
 
 
-def _squared_frequency(rows: int, columns: int, like: Tensor) -> Tensor:
-    # (f / f_N)² on the grid of rfft2; cycles per pixel over one half.
+def squared_frequency(rows: int, columns: int, like: Tensor) -> Tensor:
+    """Return (f / f_N)² on the grid of `torch.fft.rfft2`, (rows, columns//2 + 1), in the dtype and
+    on the device of `like`; f_N = 1/2 cycle/pixel along an axis.
+    """
     vertical = torch.fft.fftfreq(rows, dtype=like.dtype, device=like.device) / 0.5
     horizontal = torch.fft.rfftfreq(columns, dtype=like.dtype, device=like.device) / 0.5
     return vertical[:, None] ** 2 + horizontal[None, :] ** 2

@@ -8,14 +8,66 @@ it inexactly.  For a fixed size it is four products with matrices of cosines and
 The filter is computed once and stored, so nothing of the point spread function is left to compute.
 """
 
+import copy
 import math
 
 import torch
 from torch import Tensor, nn
 
-from dolens.reconstruction.restoration import WienerUNetRestoration
+from dolens.reconstruction.feature_wiener import DeconvolvedRestoration
+from dolens.reconstruction.restoration import COLORS, WienerUNetRestoration
 from dolens.reconstruction.wiener import close_periodically, padded_lengths, wiener_filter
 from dolens.sensor.colour import linear_to_srgb
+
+
+class FourierMatrices(nn.Module):
+    """The Fourier transform of real images of one size and its inverse, as products of matrices.
+
+    Args:
+        rows: of the images.
+        columns: of the images.
+        dtype: of the images.
+    """
+
+    row_cosine: Tensor
+    row_sine: Tensor
+    column_cosine: Tensor
+    column_sine: Tensor
+    inverse_cosine: Tensor
+    inverse_sine: Tensor
+
+    def __init__(self, rows: int, columns: int, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.rows, self.columns = rows, columns
+        half = columns // 2 + 1
+        # A real image's spectrum is known by half of its columns: the others count through these.
+        counts = torch.full((half,), 2.0, dtype=torch.float64)
+        counts[0] = 1.0
+        if columns % 2 == 0:
+            counts[-1] = 1.0
+        cosine, sine = _matrices(columns, half)
+        inverse = counts / (rows * columns)
+        stored = {
+            "row_cosine": _matrices(rows, rows)[0],
+            "row_sine": _matrices(rows, rows)[1],
+            "column_cosine": cosine,
+            "column_sine": sine,
+            "inverse_cosine": (cosine * inverse).T,
+            "inverse_sine": (sine * inverse).T,
+        }
+        for name, value in stored.items():
+            self.register_buffer(name, value.to(dtype).contiguous())
+
+    def transform(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return real and imaginary parts (..., rows, columns // 2 + 1) of a spectrum."""
+        a, b = image @ self.column_cosine, -(image @ self.column_sine)
+        return self.row_cosine @ a + self.row_sine @ b, self.row_cosine @ b - self.row_sine @ a
+
+    def inverse(self, real: Tensor, imaginary: Tensor) -> Tensor:
+        """Return the image (..., rows, columns) of a spectrum."""
+        a = self.row_cosine @ real - self.row_sine @ imaginary
+        b = self.row_cosine @ imaginary + self.row_sine @ real
+        return a @ self.inverse_cosine - b @ self.inverse_sine
 
 
 class WienerMatrices(nn.Module):
@@ -31,12 +83,6 @@ class WienerMatrices(nn.Module):
 
     weight_real: Tensor
     weight_imaginary: Tensor
-    row_cosine: Tensor
-    row_sine: Tensor
-    column_cosine: Tensor
-    column_sine: Tensor
-    inverse_cosine: Tensor
-    inverse_sine: Tensor
 
     def __init__(
         self,
@@ -48,50 +94,111 @@ class WienerMatrices(nn.Module):
     ) -> None:
         super().__init__()
         self.height, self.width = height, width
-        size = point_spread_function.shape[-1]
-        self.rows, self.columns = padded_lengths(height, width, margin, size)
+        rows, columns = padded_lengths(height, width, margin, point_spread_function.shape[-1])
         weight = wiener_filter(
             point_spread_function.detach().double(),
             noise_to_signal.detach().double(),
-            self.rows,
-            self.columns,
+            rows,
+            columns,
         )
         dtype = point_spread_function.dtype
-        half = self.columns // 2 + 1
-        # A real image's spectrum is known by half of its columns: the others count through these.
-        counts = torch.full((half,), 2.0, dtype=torch.float64)
-        counts[0] = 1.0
-        if self.columns % 2 == 0:
-            counts[-1] = 1.0
-        cosine, sine = _matrices(self.columns, half)
-        inverse = counts / (self.rows * self.columns)
-        stored = {
-            "weight_real": weight.real,
-            "weight_imaginary": weight.imag,
-            "row_cosine": _matrices(self.rows, self.rows)[0],
-            "row_sine": _matrices(self.rows, self.rows)[1],
-            "column_cosine": cosine,
-            "column_sine": sine,
-            "inverse_cosine": (cosine * inverse).T,
-            "inverse_sine": (sine * inverse).T,
-        }
-        for name, value in stored.items():
-            self.register_buffer(name, value.to(dtype).contiguous())
+        self.fourier = FourierMatrices(rows, columns, dtype)
+        self.register_buffer("weight_real", weight.real.to(dtype).contiguous())
+        self.register_buffer("weight_imaginary", weight.imag.to(dtype).contiguous())
 
     def forward(self, image: Tensor) -> Tensor:
         """Deconvolve linear light (B, C, height, width), not clamped."""
-        image = close_periodically(image, self.rows, self.columns)
-        a, b = image @ self.column_cosine, -(image @ self.column_sine)
-        real = self.row_cosine @ a + self.row_sine @ b
-        imaginary = self.row_cosine @ b - self.row_sine @ a
-        real, imaginary = (
+        image = close_periodically(image, self.fourier.rows, self.fourier.columns)
+        real, imaginary = self.fourier.transform(image)
+        restored = self.fourier.inverse(
             real * self.weight_real - imaginary * self.weight_imaginary,
             real * self.weight_imaginary + imaginary * self.weight_real,
         )
-        a = self.row_cosine @ real - self.row_sine @ imaginary
-        b = self.row_cosine @ imaginary + self.row_sine @ real
-        restored = a @ self.inverse_cosine - b @ self.inverse_sine
         return restored[..., : self.height, : self.width]
+
+
+class FilterMatrices(nn.Module):
+    """Filter images of one size by given filters that mix their channels.
+
+        out_n = Σ_c w_nc·in_c   at every frequency.
+
+    Args:
+        weights: w, (N, C, R, S // 2 + 1), complex.
+        columns: S, of the padded images.
+        height: of the images, pixels.
+        width: of the images, pixels.
+        dtype: of the images.
+    """
+
+    weight_real: Tensor
+    weight_imaginary: Tensor
+
+    def __init__(
+        self, weights: Tensor, columns: int, height: int, width: int, dtype: torch.dtype
+    ) -> None:
+        super().__init__()
+        self.height, self.width = height, width
+        self.fourier = FourierMatrices(weights.shape[-2], columns, dtype)
+        self.register_buffer("weight_real", weights.real.to(dtype).contiguous())
+        self.register_buffer("weight_imaginary", weights.imag.to(dtype).contiguous())
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map (B, C, height, width) to (B, N, height, width)."""
+        image = close_periodically(image, self.fourier.rows, self.fourier.columns)
+        real, imaginary = (part[:, None] for part in self.fourier.transform(image))
+        found = self.fourier.inverse(
+            (real * self.weight_real - imaginary * self.weight_imaginary).sum(2),
+            (real * self.weight_imaginary + imaginary * self.weight_real).sum(2),
+        )
+        return found[..., : self.height, : self.width]
+
+
+class _FixedWiener(nn.Module):
+    """In the place of an `OpponentWiener`."""
+
+    def __init__(self, filters: FilterMatrices) -> None:
+        super().__init__()
+        self.filters = filters
+
+    def forward(self, image: Tensor, functions: Tensor | None) -> Tensor:
+        return self.filters(image).unflatten(1, (-1, COLORS))
+
+
+class _FixedFeatures(nn.Module):
+    """In the place of `LearnedFeatures`."""
+
+    def __init__(self, filters: FilterMatrices) -> None:
+        super().__init__()
+        self.filters = filters
+
+    def forward(self, image: Tensor, functions: Tensor) -> Tensor:
+        return self.filters(image)
+
+
+def with_fixed_filters(
+    network: DeconvolvedRestoration, functions: Tensor, height: int, width: int
+) -> DeconvolvedRestoration:
+    """Return a copy of a network for images of one size and one lens, of real arithmetic alone.
+
+    Args:
+        network: as trained.
+        functions: point spread functions (D, 3, K, K) that it is given.
+        height: of the images, pixels.
+        width: of the images, pixels.
+    """
+    exact = copy.deepcopy(network).double()
+    fixed = copy.deepcopy(network)
+    functions, dtype = functions.detach().double(), network.dtype
+    with torch.no_grad():
+        weights, columns = exact.wiener.filters(functions, height, width)
+        filters = FilterMatrices(weights.flatten(0, 1), columns, height, width, dtype)
+        fixed.wiener = _FixedWiener(filters)  # type: ignore[assignment]
+        features = getattr(exact, "features", None)
+        if features is not None:
+            weights, columns = features.filters(functions, height, width)
+            filters = FilterMatrices(weights, columns, height, width, dtype)
+            fixed.features = _FixedFeatures(filters)
+    return fixed
 
 
 class FixedWienerUNet(nn.Module):

@@ -12,8 +12,10 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import ImageNetwork
 from dolens.reconstruction import Restoration, WienerUNetRestoration
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
+from dolens.reconstruction.feature_wiener import DeconvolvedRestoration
+from dolens.reconstruction.nafnet import NAFNet
 from dolens.reconstruction.unet import UNet
-from dolens.reconstruction.wiener_matrices import FixedWienerUNet
+from dolens.reconstruction.wiener_matrices import FixedWienerUNet, with_fixed_filters
 
 _RAW = (
     "the sensor image in linear light, (batch, 3, rows, columns), red, green and blue, the "
@@ -176,6 +178,9 @@ def exportable(
     module = real = wrapper(network, functions)
     if isinstance(network, WienerUNetRestoration):
         real = FixedWienerUNet(network, functions, rows, columns)
+    elif isinstance(network, DeconvolvedRestoration):
+        assert functions is not None  # it needs them
+        real = wrapper(with_fixed_filters(network, functions, rows, columns), functions)
     return Exportable(module, real, inputs, multiple, least, (rows, columns), network.dtype)
 
 
@@ -187,6 +192,8 @@ def _sizes(network: Restoration) -> tuple[int | None, int]:
     for part in inner.modules():
         if isinstance(part, UNet):
             return 2**part.depth, 2
+        if isinstance(part, NAFNet):
+            return part.multiple, 2
         if isinstance(part, FeaturePyramid):
             return part.backbone.stride, 2
     return None, 2

@@ -18,7 +18,10 @@ from dolens.experiments.camera.network_export import export_onnx, export_torch
 from dolens.experiments.camera.reconstruction import restoration_of
 from dolens.reconstruction import (
     FeaturePyramidRestoration,
+    FeatureWienerRestoration,
+    NAFNetRestoration,
     UNetRestoration,
+    WienerNAFNetRestoration,
     WienerUNetRestoration,
 )
 
@@ -90,6 +93,31 @@ def test_deconvolution_by_matrices_is_that_by_fourier_transforms(blur):
     raw = torch.rand(2, 3, 13, 18, dtype=torch.float64)
     with torch.no_grad():
         assert (found.real_module(raw) - found.module(raw)).abs().max() < 1e-11
+
+
+@pytest.mark.parametrize("kind", ["depths", "features", "nafnet"])
+def test_filters_that_mix_colours_are_exported_with_the_lens_built_in(kind, blur, tmp_path):
+    nafnet = {"width": 2, "down": (1,), "up": (1,)}
+    network = {
+        "depths": lambda: FeatureWienerRestoration(width=2, depth=1, margin=4, depths=2),
+        "features": lambda: FeatureWienerRestoration(2, 1, margin=4, features=2, scales=2),
+        "nafnet": lambda: WienerNAFNetRestoration(**nafnet, margin=4),
+    }[kind]()
+    found = exportable(camera_of(network.double(), (21, 16), blur.double()))
+    raw = torch.rand(2, 3, 21, 16, dtype=torch.float64)
+    with torch.no_grad():
+        assert (found.real_module(raw) - found.module(raw)).abs().max() < 1e-11
+    found = exportable(camera_of(network.float(), (21, 16), blur))
+    onnx = export_onnx(found, tmp_path / "network.onnx")
+    assert onnx.facts["largest_error"] < 1e-4
+    assert onnx.facts["sizes"] == "21 rows and 16 columns only; any batch"
+
+
+def test_a_nafnet_takes_multiples_of_its_groups_and_halvings(tmp_path):
+    found = exportable(camera_of(NAFNetRestoration(2, (1,), 1, (1,))))
+    assert found.multiple == 4 and found.size == (24, 20)
+    assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
+    assert export_onnx(found, tmp_path / "network.onnx").facts["largest_error"] < 1e-5
 
 
 def test_a_feature_pyramid_takes_multiples_of_its_backbone_s_stride(tmp_path):

@@ -18,7 +18,7 @@ EXPERIMENT = "experiment=wavefront_coding"
 
 
 @pytest.mark.parametrize("coordinates", ["false", "true"])
-@pytest.mark.parametrize("name", ["unet", "feature_pyramid"])
+@pytest.mark.parametrize("name", ["unet", "nafnet", "feature_pyramid"])
 def test_networks_alone_begin_as_the_encoded_image(composed, name, coordinates, caplog):
     cfg = composed(EXPERIMENT, f"network={name}", f"network.field_coordinates={coordinates}")
     if name == "feature_pyramid":
@@ -29,6 +29,21 @@ def test_networks_alone_begin_as_the_encoded_image(composed, name, coordinates, 
     assert network.needs_field == (coordinates == "true")
     raw = torch.rand(1, 3, 32, 40)
     assert torch.equal(network(raw, field=torch.rand(1, 2, 32, 40)), linear_to_srgb(raw))
+
+
+@pytest.mark.parametrize("coordinates", ["false", "true"])
+@pytest.mark.parametrize("name", ["feature_wiener", "unrolled_splitting", "wiener_nafnet"])
+def test_deconvolving_networks_take_the_camera_s_functions(composed, name, coordinates):
+    cfg = composed(EXPERIMENT, f"network={name}", f"network.field_coordinates={coordinates}")
+    assert cfg.network.margin == 32
+    network = instantiate(cfg.network)
+    assert isinstance(network, Restoration) and network.needs_point_spread_function
+    assert network.needs_field == (coordinates == "true")
+    functions = torch.zeros(3, 3, 65, 65)
+    functions[..., 32, 32] = 1.0
+    raw = torch.full((1, 3, 32, 40), 0.4)
+    restored = network.eval()(raw, functions, torch.rand(1, 2, 32, 40))
+    torch.testing.assert_close(restored, linear_to_srgb(raw))
 
 
 @pytest.mark.parametrize("name", ["restoration", "deblurgan"])

@@ -1,0 +1,1 @@
+"""Networks compared behind one fixed lens: the parts of scripts/reconstruction_quality.py."""
