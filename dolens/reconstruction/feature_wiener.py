@@ -25,6 +25,8 @@ from dolens.sensor.colour import linear_to_srgb
 # Initial noise over signal power at the Nyquist frequency: luminance, red against blue, green
 # against both.  Fitted to photographs at 100 electrons of white.
 NOISE_TO_SIGNAL = (1.0, 7.0, 20.0)
+# Values along each side of the kernels of learned features.
+_KERNEL = 5
 
 
 class DeconvolvedRestoration(Restoration):
@@ -191,6 +193,3 @@ class LearnedFeatures(nn.Module):
             spread[:, ::spacing, ::spacing] = kernel
             found.append(transfer_function(spread, rows, columns))
         return torch.stack(found)
-
-
-_KERNEL = 5
