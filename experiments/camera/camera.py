@@ -141,6 +141,11 @@ class CameraModule(Camera):
         views.expose(self.lens)
         check_miscalibrations(self.evaluation.miscalibrations, lens)
         self.manufacture = manufacture_of(as_built, tolerances, self.lens, views)
+        if self.manufacture and self.manufacture.settings.desensitising and self.lens_steps.apart:
+            raise InputError(
+                "as_built.desensitising: allowed where least squares move the lens "
+                "(optimizer.lens=dls): 0, as they do not know of it"
+            )
         self.made_scores: MadeLensScores | None = None
         self._made_crops: list[Tensor] = []
 

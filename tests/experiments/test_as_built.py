@@ -228,6 +228,12 @@ def test_a_renderer_whose_images_stay_where_the_design_s_are_is_refused(composed
         run(composed(*AS_BUILT, "renderer=rays"))
 
 
+def test_least_squares_refuse_a_weight_that_they_would_not_see(composed):
+    asked = ["optimizer.lens=dls", "as_built.desensitising=0.1"]
+    with pytest.raises((InputError, InstantiationException), match=r"as_built\.desensitising"):
+        run(composed(*AS_BUILT, *asked))
+
+
 def test_no_tolerances_are_not_the_lens_as_drawn(composed):
     with pytest.raises((InputError, InstantiationException), match="tolerances: none is given"):
         run(composed("experiment=wavefront_coding", *TINY, *TINY_NETWORK, "tolerances={}"))
