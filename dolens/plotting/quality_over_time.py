@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from dolens.plotting.legends import legend_below
@@ -40,7 +41,7 @@ def quality_figure(
     """
     figure = Figure(figsize=(PAGE * 0.8, 3.8), layout="constrained")
     axes = figure.subplots()
-    handles = []
+    handles: list[Artist] = []
     for curve, colour, marker in zip(found, colours(len(found)), _MARKERS, strict=False):
         below = [q - low for q, low in zip(curve.quality, curve.low, strict=True)]
         above = [high - q for q, high in zip(curve.quality, curve.high, strict=True)]
@@ -54,7 +55,7 @@ def quality_figure(
             marker=marker,
             elinewidth=0.6,
         )
-        handles.append(bars)
+        handles.append(bars.lines[0])
     axes.set_xlim(left=0.0)
     axes.set_xlabel("seconds of training, one processor", fontsize=SMALL)
     axes.set_ylabel("PSNR at the worst depth (dB)", fontsize=SMALL)
