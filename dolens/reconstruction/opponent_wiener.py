@@ -232,10 +232,15 @@ def _times(matrix: Tensor, colours: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _inverse(matrix: Symmetric) -> Symmetric:
-    """Return the inverse of symmetric 3×3 matrices: elements 11, 12, 13, 22, 23, 33 of each."""
-    a, b, c, d, e, f = matrix
+    """Return the inverse of symmetric 3×3 matrices: elements 11, 12, 13, 22, 23, 33 of each.
+
+    Elements are divided by the trace first: the determinant is a product of three of them, and
+    its square, which the derivative has, would leave single precision.
+    """
+    trace = matrix[0] + matrix[3] + matrix[5]
+    a, b, c, d, e, f = (element / trace for element in matrix)
     first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
-    scale = 1.0 / (a * first + b * second + c * third)
+    scale = 1.0 / (trace * (a * first + b * second + c * third))
     return (
         first * scale,
         second * scale,

@@ -59,7 +59,7 @@ def test_the_table_of_runs_has_what_was_chosen_and_the_objective_first(composed,
     assert columns["network.width"].number_value == 6
     assert columns["data.scale_range"].string_value == "[1.0, 1.5]"
     assert columns["experiment"].string_value == "wavefront_coding"
-    assert columns["network"].string_value == "wiener_unet"
+    assert columns["network"].string_value == "feature_wiener"
     assert columns["seed"].number_value == 0
     assert not [name for name in columns if name.startswith(("callbacks", "logger", "hydra"))]
     assert len(columns) < 50

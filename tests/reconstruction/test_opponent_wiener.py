@@ -169,3 +169,13 @@ def test_ratios_are_three_positive_numbers(wrong):
 def test_negative_numbers_are_refused(margin, depths):
     with pytest.raises(InputError, match="must be at least 0"):
         OpponentWiener(margin, (1.0, 1.0, 1.0), depths)
+
+
+def test_functions_that_lose_nearly_all_light_have_finite_gradients_in_single_precision():
+    functions = 1e-5 * torch.rand(2, 3, 9, 9, generator=torch.Generator().manual_seed(0))
+    functions.requires_grad_(True)
+    ratios = torch.tensor([1.0, 7.0, 20.0], requires_grad=True)
+    image = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    restored = opponent_wiener_deconvolve(image, functions, ratios, 4)
+    gradients = torch.autograd.grad(restored.square().mean(), (functions, ratios))
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
