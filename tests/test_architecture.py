@@ -22,6 +22,7 @@ ALLOWED = {
     "spinning": {"openmp", "processors"},
     "user_cache": set(),
     "cached_tensors": set(),
+    "seeded_generators": set(),
     "packaged": {"errors"},
     "kernels": {"cached_tensors", "errors", "openmp", "stages", "user_cache"},
     "optics": {"cached_tensors", "errors", "file_text", "html", "kernels"},
@@ -32,7 +33,7 @@ ALLOWED = {
     "diffraction": {"errors", "optics", "scene", "sensor", "analysis"},
     "rendering": {
         *("cached_tensors", "errors", "stages", "optics", "kernels", "scene", "sensor"),
-        *("analysis", "diffraction"),
+        *("analysis", "diffraction", "seeded_generators"),
     },
     # Bounded steps of thousands of lenses are a kernel.
     "optimize": {"errors", "typed_values", "kernels", "optics", "analysis", "rendering"},

@@ -1,4 +1,4 @@
-"""How many lenses of a series make how good a camera."""
+"""This module draws how many lenses of a series make how good a camera."""
 
 from collections.abc import Mapping
 
