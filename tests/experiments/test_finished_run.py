@@ -91,8 +91,10 @@ def test_overrides_are_applied_over_the_run_s_own(tiny_run):
 def test_a_run_keeps_its_own_settings_where_files_say_something_else_now(copy):
     """Only what an override changes is taken from the configuration's files."""
     file = copy / ".hydra/resolved.yaml"
-    file.write_text(file.read_text().replace("noise_to_signal: 0.5", "noise_to_signal: 0.25"))
-    assert load_run(copy, overrides=["light=50"]).cfg.network.noise_to_signal == 0.25
+    said = file.read_text()
+    file.write_text(said.replace("noise_to_signal:\n  - 1.0", "noise_to_signal:\n  - 0.25"))
+    assert file.read_text() != said
+    assert load_run(copy, overrides=["light=50"]).cfg.network.noise_to_signal == [0.25, 7.0, 20.0]
 
 
 def test_classes_of_the_former_package_are_found(copy):
