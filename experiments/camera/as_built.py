@@ -133,6 +133,11 @@ class Manufacture:
         """Return whether training images are taken through lenses that are made."""
         return self.settings.train
 
+    @property
+    def gives_the_design_s_functions(self) -> bool:
+        """Return whether a network is given the same functions for all lenses, the design's."""
+        return self.settings.calibration == "design"
+
     def for_step(self, lens: Lens, values: Mapping[str, Tensor], step: int) -> list[MadeLens]:
         """Return the lenses of a training step, differentiable in the design."""
         return self._made(lens, values, self.settings.lenses_per_step, step)
@@ -160,7 +165,7 @@ class Manufacture:
             design: its variables.
             made: the lens whose images it restores.
         """
-        if self.settings.calibration == "design":
+        if self.gives_the_design_s_functions:
             return self._views.point_spread_functions(lens, design)
         own = self._views.point_spread_functions(lens, made.values)
         if self.settings.calibration == "own":

@@ -76,11 +76,12 @@ def images_of_made_lenses(
         arguments = (camera.lens, made.values, part, "train", camera.global_step, None)
         # Views that know no shares are asked for none.
         taken.append(camera.views.take(*arguments) if alone else camera.views.take(*arguments, own))
-        functions.append(
-            manufacture.functions(camera.lens, design, made)
-            if camera.network.needs_point_spread_function
-            else None
-        )
+        if not camera.network.needs_point_spread_function:
+            functions.append(None)
+        elif functions and manufacture.gives_the_design_s_functions:
+            functions.append(functions[0])
+        else:
+            functions.append(manufacture.functions(camera.lens, design, made))
     fields = [part.field for part in taken if part.field is not None]
     return (
         Views(

@@ -146,16 +146,15 @@ def made_lens_scores(
         return found.unflatten(0, truth.shape[:2]).mean(0).double().cpu()
 
     with evaluating(camera.network):
-        as_drawn = scores(dict(design), camera.functions(design))
+        of_design = camera.functions(design)
+        as_drawn = scores(dict(design), of_design)
         rows, errors = [], []
         for number in range(manufacture.settings.tested):
             with camera.exact():
                 made = manufacture.tested(camera.lens, design, number)
-                functions = (
-                    manufacture.functions(camera.lens, design, made)
-                    if camera.network.needs_point_spread_function
-                    else None
-                )
+                functions = of_design
+                if of_design is not None and not manufacture.gives_the_design_s_functions:
+                    functions = manufacture.functions(camera.lens, design, made)
             rows.append(scores(made.values, functions))
             errors.append(made.errors)
     seconds = (time.perf_counter() - started) / (len(rows) + 1)
