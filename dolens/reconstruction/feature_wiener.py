@@ -10,7 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.reconstruction.field_coordinates import FIELD_CHANNELS, with_field_channels
+from dolens.reconstruction.field_coordinates import (
+    FIELD_CHANNELS,
+    required_field,
+    with_field_channels,
+)
 from dolens.reconstruction.opponent_wiener import OpponentWiener, check_functions, correlations
 from dolens.reconstruction.restoration import COLORS, Restoration
 from dolens.reconstruction.unet import UNet
@@ -73,13 +77,7 @@ class DeconvolvedRestoration(Restoration):
         others = self.others(raw, point_spread_functions.to(raw))
         seen = torch.cat([pictures.flatten(1, 2), linear_to_srgb(raw), *others], dim=1)
         if self.needs_field:
-            if field is None:
-                raise InputError(
-                    f"{type(self).__name__} with field_coordinates=true needs `field`, the pixels' "
-                    "coordinates on the sensor, got None: give (B, 2, H, W), or "
-                    "field_coordinates=false"
-                )
-            seen = with_field_channels(seen, field)
+            seen = with_field_channels(seen, required_field(field, type(self).__name__))
         return pictures[:, 0] + self.network(seen)
 
 

@@ -35,3 +35,21 @@ def with_field_channels(image: Tensor, field: Tensor) -> Tensor:
             "of each pixel over half the sensor's diagonal"
         )
     return torch.cat([image, field_channels(field.to(image.dtype))], dim=1)
+
+
+def required_field(field: Tensor | None, network: str) -> Tensor:
+    """Return the field that a network with field coordinates needs.
+
+    Args:
+        field: (B, 2, H, W), or None.
+        network: its class's name; the message begins with it.
+
+    Raises:
+        InputError: the field is None.
+    """
+    if field is None:
+        raise InputError(
+            f"{network} with field_coordinates=true needs `field`, the pixels' coordinates on the "
+            "sensor, got None: give (B, 2, H, W), or field_coordinates=false"
+        )
+    return field

@@ -9,7 +9,11 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.reconstruction.backbones import load_backbone
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
-from dolens.reconstruction.field_coordinates import FIELD_CHANNELS, with_field_channels
+from dolens.reconstruction.field_coordinates import (
+    FIELD_CHANNELS,
+    required_field,
+    with_field_channels,
+)
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import wiener_deconvolve
 from dolens.sensor.colour import linear_to_srgb
@@ -95,11 +99,7 @@ class ResidualRestoration(Restoration):
         encoded = linear_to_srgb(raw.to(self.dtype))
         if not self.needs_field:
             return encoded + self.network(encoded)
-        if field is None:
-            raise InputError(
-                f"{type(self).__name__} with field_coordinates=true needs `field`, the pixels' "
-                "coordinates on the sensor, got None: give (B, 2, H, W), or field_coordinates=false"
-            )
+        field = required_field(field, type(self).__name__)
         return encoded + self.network(with_field_channels(encoded, field))
 
 

@@ -8,7 +8,11 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.reconstruction.feature_wiener import NOISE_TO_SIGNAL
-from dolens.reconstruction.field_coordinates import FIELD_CHANNELS, with_field_channels
+from dolens.reconstruction.field_coordinates import (
+    FIELD_CHANNELS,
+    required_field,
+    with_field_channels,
+)
 from dolens.reconstruction.opponent_wiener import (
     OpponentWiener,
     check_functions,
@@ -87,12 +91,8 @@ class UnrolledSplittingRestoration(Restoration):
             InputError: `point_spread_functions` is None or not of shape (D, 3, K, K), or `field` is
                 needed, and is None or not of shape (B, 2, H, W).
         """
-        if self.needs_field and field is None:
-            raise InputError(
-                "UnrolledSplittingRestoration with field_coordinates=true needs `field`, the "
-                "pixels' coordinates on the sensor, got None: give (B, 2, H, W), or "
-                "field_coordinates=false"
-            )
+        if self.needs_field:
+            required_field(field, type(self).__name__)
         raw = raw.to(self.dtype)
         first = encoded = linear_to_srgb(self.wiener(raw, point_spread_functions)[:, 0])
         assert point_spread_functions is not None  # the deconvolution has looked
