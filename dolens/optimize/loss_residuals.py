@@ -100,13 +100,13 @@ class LossResiduals(RayInterceptQuality):
         if self.curvature == "step":
             along = slope / slope.norm().clamp(min=1e-300)
             moved = (jacobian @ (right.T @ (along / moves))).reshape(1, 2, -1)
-            own = 0.5 * (second(moved) * moved).sum()
+            own = 0.5 * second(moved).sum()
             directions = torch.eye(len(moves), dtype=moves.dtype)
             # Where the loss is flat or concave, no step is longer than the spots are wide.
             curvature = (own if own > 0.0 else slope.norm() / max(width, 1e-300)).expand_as(moves)
         else:
             moved = (jacobian @ (right.T / moves)).T.reshape(len(moves), 2, -1)
-            square = 0.5 * torch.einsum("iaj,kaj->ik", moved, second(moved))
+            square = 0.5 * second(moved)
             values, directions = torch.linalg.eigh(0.5 * (square + square.T))
             # A saddle is left downhill both ways; no step is longer than the spots are wide.
             longest = (directions.T @ slope).abs() / max(width, 1e-300)
@@ -117,20 +117,29 @@ class LossResiduals(RayInterceptQuality):
         return LinearModel(float(right @ right), rows, right), None
 
     def _derivatives(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Return ∂L/∂p (2, N), and the product of ∂²L/∂p² with rays' displacements (D, 2, N)."""
+        """Return ∂L/∂p (2, N), and m_iᵀ (∂²L/∂p²) m_j (D, D) as a function of rays' displacements
+        m (D, 2, N).  A loss may know the latter itself, as `second_derivatives`.
+        """
+        own = getattr(self.intercept_loss, "second_derivatives", None)
         points = points.detach().requires_grad_()
         with torch.enable_grad():
-            (gradient,) = torch.autograd.grad(self._loss(points), points, create_graph=True)
+            (gradient,) = torch.autograd.grad(self._loss(points), points, create_graph=own is None)
 
         def product(displacements: Tensor) -> Tensor:
+            if own is not None:
+                with torch.no_grad():
+                    return own(points.detach(), self._groups, displacements)
             (found,) = torch.autograd.grad(
                 gradient, points, displacements, is_grads_batched=True, retain_graph=True
             )
-            return found
+            return torch.einsum("iaj,kaj->ik", displacements, found)
 
         return gradient.detach(), product
 
     def _loss(self, deviations: Tensor) -> Tensor:
         assert self.intercept_loss is not None  # it was checked
-        groups = RayGroups(self.group_shares, self.group, self.group_weights)
-        return self.intercept_loss(deviations, groups)
+        return self.intercept_loss(deviations, self._groups)
+
+    @property
+    def _groups(self) -> RayGroups:
+        return RayGroups(self.group_shares, self.group, self.group_weights)

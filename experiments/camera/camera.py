@@ -53,6 +53,7 @@ _METRICS = (
     "operand/*",
     "lens_step/*",
     "lens_steps/*",
+    "lens_first/*",
     "auto/*",
     "made/*",
     "error/made/*",
@@ -203,6 +204,13 @@ class CameraModule(Camera):
             "lr_scheduler": {"scheduler": self.scheduler(optimizer), "interval": "step"},
         }
 
+    def on_train_start(self) -> None:
+        """Design the lens before the first step, where its optimizer begins so."""
+        if self.global_step == 0:
+            with named_stage("designing the lens for its deconvolved error"):
+                knows_blur = self.network.needs_point_spread_function
+                self.lens_steps.begin(knows_blur, self.view_norm)
+
     def on_train_epoch_start(self) -> None:
         """Let the renderer look at the lens as it is now.
 
@@ -211,6 +219,7 @@ class CameraModule(Camera):
         epoch's first step comes here instead.
         """
         self._looked_in_epoch = self.current_epoch
+        self.variables.scaled.requires_grad_(True)  # a renderer may compare derivatives
         if self.trainer.is_global_zero:
             with named_stage("looking at the lens"):
                 photographs = self._photographs()
@@ -226,7 +235,11 @@ class CameraModule(Camera):
         return None if found is None else found()
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
-        """Start the step's clock."""
+        """Start the step's clock; let the lens stand still where its share of the steps is over."""
+        if processes() == 1:  # elsewhere all parameters have derivatives in every step
+            until = getattr(self.optimizer, "until", 1.0)
+            moves = self.global_step < until * self.trainer.estimated_stepping_batches
+            self.variables.scaled.requires_grad_(moves)
         if batch_idx == 0 and self._looked_in_epoch != self.current_epoch:
             self.on_train_epoch_start()
         self.costs.start()

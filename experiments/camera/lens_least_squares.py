@@ -33,6 +33,8 @@ class CameraOptimizer:
         lens: `adam`: the lens's variables are a group of the same optimizer (whichever it is);
             `dls`: damped least squares, in turns with it.
         least_squares: settings of `LensLeastSquares`.
+        until: share of the training steps after which the lens stands still, and no derivative of
+            it is computed.
 
     Raises:
         InputError: an unknown choice, or a setting that least squares cannot have.
@@ -43,8 +45,12 @@ class CameraOptimizer:
         network: Callable[..., torch.optim.Optimizer],
         lens: str = "adam",
         least_squares: Mapping[str, Any] | None = None,
+        until: float = 1.0,
     ) -> None:
         check_choice(lens, ("adam", "dls"), "optimizer.lens")
+        if not 0.0 <= until <= 1.0:
+            raise InputError(f"optimizer.until: {until}; allowed: 0 to 1")
+        self.until = float(until)
         self.network = network
         # Settings of what another choice would use are checked as well.
         where = "optimizer.least_squares"
@@ -68,6 +74,10 @@ class LensLeastSquares:
         every: steps of the network between two of the lens.
         trust_radius: how far rays may move in the first step, RMS over spots, pixels.
         max_trust_radius: how far they may move in any later one.
+        first_iterations: of damped least squares for the deconvolved error, before the network
+            begins to train; see `dolens.optimize.deconvolved_error`.  0: none.
+        strength: share of the best linear filter that the network is thought to find; None: 1 of
+            a network that is given point spread functions, 0 of another.
 
     Rarely needed:
         damping: of variables that undo one another.
@@ -83,6 +93,8 @@ class LensLeastSquares:
         every: int = 5,
         trust_radius: float = 0.1,
         max_trust_radius: float = 0.5,
+        first_iterations: int = 0,
+        strength: float | None = None,
         damping: float = 1e-3,
         rings: int = 4,
         arms: int = 8,
@@ -95,6 +107,15 @@ class LensLeastSquares:
                 f"optimizer.least_squares.max_trust_radius: {max_trust_radius}; allowed: from "
                 f"trust_radius, {trust_radius}, on"
             )
+        if first_iterations < 0:
+            raise InputError(
+                f"optimizer.least_squares.first_iterations: {first_iterations}; allowed: 0 or more"
+            )
+        if strength is not None and not 0.0 <= strength <= 1.0:
+            raise InputError(
+                f"optimizer.least_squares.strength: {strength}; allowed: null, or 0 to 1"
+            )
+        self.first_iterations, self.strength = int(first_iterations), strength
         self.every, self.damping = int(every), float(damping)
         self.rings, self.arms = int(rings), int(arms)
         self.trust_radius, self.max_trust_radius = float(trust_radius), float(max_trust_radius)

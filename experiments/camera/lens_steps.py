@@ -1,11 +1,16 @@
 """Training steps of a camera's lens: operands, bounds, and least squares beside the network."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from dolens.experiments.camera.deconvolved_design import (
+    DeconvolvedDesign,
+    design_for_deconvolution,
+)
 from dolens.experiments.camera.lens_least_squares import LensLeastSquares
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.views.base import Imaging
@@ -45,12 +50,38 @@ class LensSteps:
         self._pitch = views.sensor.pixel_pitch
         apart = least_squares is not None and len(variables) > 0
         self._spots = views.spots(lens, least_squares.rings, least_squares.arms) if apart else []
+        self._views = views
+        self.first: DeconvolvedDesign | None = None
         operands.check(lens, variables())
 
     @property
     def apart(self) -> bool:
         """Return whether the lens moves by least squares, which knows the operands itself."""
         return self.least_squares is not None
+
+    def begin(self, knows_blur: bool, view_norm: float) -> None:
+        """Design the lens for its deconvolved error, where least squares are to begin with that.
+
+        Args:
+            knows_blur: whether the network is given point spread functions.
+            view_norm: p of the power mean of the views' losses.
+
+        Raises:
+            InputError: rays fail.
+        """
+        least_squares = self.least_squares
+        if least_squares is None or not len(self.variables) or not least_squares.first_iterations:
+            return
+        strength = least_squares.strength
+        self.first = design_for_deconvolution(
+            self.lens,
+            self.variables,
+            self._views,
+            self.operands,
+            least_squares.first_iterations,
+            float(knows_blur) if strength is None else strength,
+            view_norm,
+        )
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the operands add to the loss, and their values by label."""
@@ -68,8 +99,10 @@ class LensSteps:
             share: of the trust radius of least squares, as the schedule has it.
 
         Returns:
-            Numbers of a step of least squares; empty without one.
+            Numbers of a step of least squares; empty without one, and where the lens stands still.
         """
+        if not self.variables.scaled.requires_grad:
+            return {}
         found: dict[str, float] = {}
         if self.least_squares is not None:
             self.least_squares.gather(self.variables)
@@ -98,6 +131,10 @@ class LensSteps:
     def numbers(self) -> dict[str, float]:
         """Return how many steps were taken and taken back."""
         numbers: dict[str, float] = {}
+        if self.first is not None:
+            numbers["lens_first/deconvolved_error"] = self.first.after
+            numbers["lens_first/deconvolved_error_before"] = self.first.before
+            numbers["lens_first/iterations"] = float(self.first.iterations)
         if self.operands.entries:
             numbers["lens_steps/taken_back"] = float(self.operands.taken_back)
         return numbers if self.least_squares is None else numbers | self.least_squares.numbers()
@@ -106,12 +143,16 @@ class LensSteps:
         """Return what a checkpoint keeps, by its key there."""
         if self.least_squares is None:
             return {}
-        return {"dolens_lens_steps": self.least_squares.state()}
+        first = None if self.first is None else asdict(self.first)
+        return {"dolens_lens_steps": {**self.least_squares.state(), "first": first}}
 
     def load_state(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on with what a checkpoint kept."""
         if self.least_squares is not None and "dolens_lens_steps" in checkpoint:
-            self.least_squares.load_state(checkpoint["dolens_lens_steps"])
+            kept = checkpoint["dolens_lens_steps"]
+            self.least_squares.load_state(kept)
+            first = kept.get("first")  # checkpoints of old lack it
+            self.first = None if first is None else DeconvolvedDesign(**first)
 
 
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:

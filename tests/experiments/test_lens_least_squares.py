@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from dolens.errors import InputError
 from dolens.experiments.camera.lens_least_squares import CameraOptimizer, LensLeastSquares
 from dolens.experiments.running.training import run
 from dolens.optimize.variables import DesignVariables
-from dolens.prescriptions import lens_from_prescription
+from dolens.prescriptions import lens_from_prescription, load_lens
+from dolens.reconstruction.linear_bound import linear_error, natural_spectrum
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY, TINY_DOUBLET, TINY_NETWORK
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=2"]
@@ -94,3 +96,72 @@ def test_a_doublet_holds_its_focal_length(composed, tmp_path):
     efl = float(lens_from_prescription(lens).first_order().efl.detach())
     assert efl == pytest.approx(67.57969, rel=1e-5)
     assert math.isfinite(metrics["test/psnr_db/field"])
+
+
+FIRST = [
+    "optimizer.lens=dls",
+    "optimizer.least_squares.first_iterations=15",
+    "optimizer.least_squares.strength=1.0",
+]
+
+
+def linear_errors(lens_file: Path) -> float:
+    """The mean error of the best linear filter over windows, from spots on pixels.
+
+    Zones have weights by their shares of the circle; each colour has a filter of its own.
+    """
+    lens, pitch = load_lens(lens_file), 0.03
+    spectrum = natural_spectrum(64, 64, 0.04, 64.0, torch.zeros((), dtype=torch.float64))
+    total = 0.0
+    for angle, weight in ((0.0, 0.06), (10.2, 0.35), (14.1, 0.4), (19.7, 0.19)):
+        for wavelength in (656.2725, 587.5618, 486.1327):
+            spot = gaussian_quadrature(lens, [(0, angle)], [wavelength], 20, 40)
+            landed = lens.trace(spot.rays).position[:, :2].double()
+            landed = landed - (spot.weight[:, None] * landed).sum(0)
+            at = (landed / pitch).round().long() + 31
+            inside = ((at >= 0) & (at < 63)).all(1)
+            function = torch.zeros(63, 63, dtype=torch.float64)
+            places = at[inside, 1], at[inside, 0]
+            function.index_put_(places, spot.weight[inside], accumulate=True)
+            error = linear_error(function[None, None], spectrum, 1e-5)
+            total += weight / 3.0 * float(error.filter_per_depth)
+    return total
+
+
+def test_a_lens_that_is_designed_first_is_better_for_linear_filters(composed, tmp_path):
+    """As spots on pixels tell; and then it stands still, since `until` is 0."""
+    run(composed(*TINY_DOUBLET, *FIXED_WINDOWS, *FIRST, "optimizer.until=0.0"))
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    first, begun = (metrics[f"lens_first/deconvolved_error{e}"] for e in ("", "_before"))
+    assert first < 0.9 * begun
+    assert metrics["lens_steps/taken"] == 0.0
+    after, before = (linear_errors(tmp_path / f"run/lens/{n}.yaml") for n in ("final", "initial"))
+    assert after < 0.95 * before
+
+
+def test_a_lens_stands_still_after_its_share_of_the_steps(composed, tmp_path):
+    """Adam moves it in the first two of four steps, as if they had been all."""
+    common = [*TINY_DOUBLET, *FIXED_WINDOWS, "optimizer.lens=adam", "scheduler.T_max=100"]
+    ends = []
+    for setting in ("optimizer.until=0.5", "trainer.max_epochs=1"):
+        run(composed(*common, setting))
+        metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+        ends.append(metrics["variables/surfaces.1.curvature"])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"first_iterations": -1}, "least_squares.first_iterations: -1"),
+        ({"strength": 2.0}, "least_squares.strength: 2.0"),
+    ],
+)
+def test_a_first_design_out_of_range_is_an_error(settings, message):
+    with pytest.raises(InputError, match=message):
+        LensLeastSquares(**settings)
+
+
+def test_a_share_out_of_range_is_an_error():
+    with pytest.raises(InputError, match=r"optimizer\.until: 1\.5; allowed: 0 to 1"):
+        CameraOptimizer(torch.optim.Adam, until=1.5)

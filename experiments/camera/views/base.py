@@ -149,6 +149,14 @@ class Imaging(ABC):
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
 
+    def spot_weights(self, fields: int) -> Sequence[float]:
+        """Return what part of the training images each of the spots' fields stands for.
+
+        Args:
+            fields: of `spots`, of each object distance.
+        """
+        return [1.0 / fields] * fields
+
     def whole_picture(
         self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
     ) -> WholePicture:

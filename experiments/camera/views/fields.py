@@ -51,6 +51,8 @@ EVERYWHERE = "field"
 _PSF_SIZE = 65
 # Functions along each side of a whole sensor, at most; strata of the pupil, likewise, of rays.
 _MOST_FIELDS, _RAYS = 17, 10
+# Windows that are drawn to find how many lie near each zone.
+_DRAWN = 1000
 
 
 class FieldViews(Imaging):
@@ -313,6 +315,20 @@ class FieldViews(Imaging):
         fields = [(0.0, share * half / magnification) for share in sorted(set(self.zones.values()))]
         wavelengths = self.scene.wavelengths
         return [gaussian_quadrature(lens, fields, wavelengths, rings, arms, depth, symmetry=False)]
+
+    def spot_weights(self, fields: int) -> list[float]:
+        """Return the share of training windows that are nearest to each of the zones' radii."""
+        shares = sorted(set(self.zones.values()))
+        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        generator, counts = generator_of(0), [0] * len(shares)
+        for _ in range(_DRAWN):
+            window = self.windows.training(generator)
+            middle = 0.5 * (window.height - 1), 0.5 * (window.width - 1)
+            x, y = window.positions(*(torch.tensor(m, dtype=torch.float64) for m in middle))
+            share = math.hypot(float(x), float(y)) / half
+            nearest = min(range(len(shares)), key=lambda n: abs(shares[n] - share))
+            counts[nearest] += 1
+        return [count / _DRAWN for count in counts]
 
 
 def _sampled(

@@ -1,0 +1,147 @@
+"""A camera's lens is designed for its deconvolved error before the network begins to train."""
+
+import copy
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.joined_spots import joined_spots
+from dolens.analysis.pupil_quadrature import with_chief_rays
+from dolens.errors import InputError
+from dolens.experiments.camera.operands import CameraOperands
+from dolens.experiments.camera.views.base import Imaging
+from dolens.optics.lens import Lens
+from dolens.optimize import DampedLeastSquares
+from dolens.optimize.deconvolved_error import DeconvolvedError, Photographs
+from dolens.optimize.loss_residuals import LossResiduals
+from dolens.optimize.merit import MeritFunction
+from dolens.optimize.variables import DesignVariables
+from dolens.sensor.readout import Readout
+
+logger = logging.getLogger(__name__)
+
+# Pixels of mean grey by which a sensor's noise is measured, and that grey, in linear light.
+_PROBE, _GREY = 128, 0.2
+# A sensor without noise would let a filter undo any blur: that of 12 bits.
+_LEAST_NOISE = 1e-8
+# Rays pass the lens as it is at the start of a round; of its gain less than this is not worth one.
+_ROUNDS, _WORTH = 3, 1e-3
+# Gains of one step, over the loss, below which a round ends.
+_TOLERANCE = 1e-4
+# Rings and arms of rays: spots of ten pixels have transfer functions up to the Nyquist frequency.
+_RINGS, _ARMS = 6, 12
+
+
+@dataclass(frozen=True)
+class DeconvolvedDesign:
+    """Says what was gained before training.
+
+    Attributes:
+        before: the deconvolved error with the operands, shares of the photographs' variance.
+        after: the same.
+        iterations: of damped least squares.
+    """
+
+    before: float
+    after: float
+    iterations: int
+
+
+def design_for_deconvolution(
+    lens: Lens,
+    variables: DesignVariables,
+    views: Imaging,
+    operands: CameraOperands,
+    iterations: int,
+    strength: float,
+    view_norm: float,
+) -> DeconvolvedDesign:
+    """Move a lens by damped least squares to where its deconvolved error is least.
+
+    Args:
+        lens: the variables' values are stored in it.
+        variables: u; they are moved.
+        views: image the scene.
+        operands: what the lens must be besides.
+        iterations: at most.
+        strength: share of the best linear filter that the network is thought to find; see
+            `DeconvolvedError`.
+        view_norm: p of the power mean of the views' errors.
+
+    Raises:
+        InputError: rays fail where training begins.
+    """
+    first, reached, made = math.nan, math.inf, 0
+    for _ in range(_ROUNDS):
+        merit = merit_of(lens, variables, views, operands, strength, view_norm)
+        steps = DampedLeastSquares([variables.parameter_group()], merit_tolerance=_TOLERANCE)
+        begun = merit().sum_of_squares()
+        if not math.isfinite(begun):
+            raise InputError(
+                "optimizer.least_squares.first_iterations: rays of the views' spots fail where "
+                "training begins; allowed there: 0"
+            )
+        first = begun if made == 0 else first
+        found = begun
+        while made < iterations and steps.stopped is None:
+            found, made = float(steps.step(merit)), made + 1
+        variables.project()
+        variables.write_to(lens)
+        if made >= iterations or begun - found <= _WORTH * begun:
+            reached = found
+            break
+        reached = found
+    logger.info(
+        "The lens was designed for its deconvolved error in %d iterations: %.4g, before %.4g",
+        made,
+        reached,
+        first,
+    )
+    return DeconvolvedDesign(first, reached, made)
+
+
+def merit_of(
+    lens: Lens,
+    variables: DesignVariables,
+    views: Imaging,
+    operands: CameraOperands,
+    strength: float,
+    view_norm: float,
+) -> MeritFunction:
+    """Return the deconvolved error of a camera's views, with its operands, as a merit function.
+
+    Views of one field at several depths share a filter.
+    """
+    distances = [distance if math.isfinite(distance) else None for distance in views.scene.depths]
+    parts = views.spots(lens, _RINGS, _ARMS)
+    spots = joined_spots(
+        [with_chief_rays(lens, part, d) for part, d in zip(parts, distances, strict=True)]
+    )
+    colours = len(views.scene.wavelengths)
+    fields = parts[0].count // colours
+    photographs = Photographs(views.sensor.pixel_pitch, noise_of(views.readout))
+    loss = DeconvolvedError.of_spots(
+        spots,
+        [number % fields for number in range(fields * len(parts))],
+        [number // colours for number in range(spots.count)],
+        list(views.spot_weights(fields)) * len(parts),
+        photographs,
+        view_norm,
+        strength,
+    )
+    even = torch.full((spots.count,), 1.0 / spots.count, dtype=torch.float64)
+    quality = LossResiduals(spots, even, "chief", "polychromatic", 1.0, intercept_loss=loss)
+    own = copy.deepcopy(lens)
+    own.object_distance = operands.object_distance
+    return MeritFunction(own, variables, quality, operands.entries)
+
+
+@torch.no_grad()
+def noise_of(readout: Readout) -> float:
+    """Return the variance of a pixel of mean grey, in linear light, as it is read out."""
+    grey: Tensor = torch.full((1, 1, 3, _PROBE, _PROBE), _GREY)
+    read = readout.develop(readout(grey, torch.Generator().manual_seed(0)))
+    return max(float(read.var(dim=(-2, -1)).mean()), _LEAST_NOISE)

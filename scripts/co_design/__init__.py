@@ -1,0 +1,1 @@
+"""Co-designs on which optimizers of a lens are compared: the parts of scripts/co_designs.py."""

@@ -1,0 +1,141 @@
+"""Train a co-design for seconds of one processor, and judge it."""
+
+import logging
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from dolens.experiments.camera.camera import CameraModule
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.threads import set_threads
+from dolens.experiments.running.training import build_lens
+
+_ROOT = Path(__file__).resolve().parents[2]
+# Steps of two short trainings, whose difference tells what a step costs.
+_SHORT, _LONG = 5, 20
+
+
+class Trainings:
+    """Trains co-designs, each for the same process time of one thread.
+
+    Args:
+        data: overrides that choose the photographs.
+        seconds: of process time; a design before the first step is part of it.
+    """
+
+    def __init__(self, data: Sequence[str], seconds: float) -> None:
+        set_threads(1)
+        warnings.filterwarnings("ignore")
+        logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+        self._data, self._seconds = tuple(data), seconds
+        self._step_costs: dict[tuple[str, ...], float] = {}
+
+    def scores(self, overrides: Sequence[str], seed: int, split: str) -> dict[str, float]:
+        """Train, and return scores with what it cost.
+
+        Args:
+            overrides: of `train.py`.
+            seed: of the run.
+            split: `val` or `test`.
+        """
+        module, _, _ = self._made([*overrides, *_steps(1)], seed)
+        begun = time.process_time()
+        module.lens_steps.begin(module.network.needs_point_spread_function, module.view_norm)
+        left = self._seconds - (time.process_time() - begun)
+        steps = max(1, round(left / self._step_cost(list(overrides))))
+        module, data, score = self._made([*overrides, *_steps(steps)], seed)
+        seconds = _fit(module, data, steps)
+        trainer = _trainer(steps)
+        if split == "val":
+            trainer.validate(module, data, verbose=False)
+        else:
+            trainer.test(module, data, verbose=False)
+        found = {k: float(v) for k, v in trainer.callback_metrics.items()}
+        return {
+            "score": found[f"{split}/{score}"],
+            "psnr_db": found[f"{split}/psnr_db"],
+            "worst": found[f"{split}/psnr_db/worst"],
+            "raw_psnr_db": found[f"{split}/raw_psnr_db"],
+            "steps": float(steps),
+            "seconds": seconds,
+        }
+
+    def _step_cost(self, overrides: list[str]) -> float:
+        """Return process seconds of a step; a lens that stands still after a share costs less."""
+        until = [o for o in overrides if o.startswith("optimizer.until=")]
+        share = float(until[0].split("=")[1]) if until else 1.0
+        others = [
+            o
+            for o in overrides
+            if not o.startswith(("optimizer.until", "optimizer.least_squares", "learning_rates"))
+        ]
+        moving, still = (self._measured(others, moves) for moves in ("1.0", "0.0"))
+        return share * moving + (1.0 - share) * still
+
+    def _measured(self, overrides: list[str], until: str) -> float:
+        key = (*overrides, until)
+        if key not in self._step_costs:
+            whole = [*overrides, f"optimizer.until={until}"]
+            costs = []
+            for _ in range(2):
+                times = []
+                for steps in (_SHORT, _LONG):
+                    module, data, _ = self._made([*whole, *_steps(steps)], 0)
+                    times.append(_fit(module, data, steps))
+                costs.append((times[1] - times[0]) / (_LONG - _SHORT))
+            self._step_costs[key] = min(costs)
+        return self._step_costs[key]
+
+    def _made(self, overrides: Sequence[str], seed: int) -> tuple[CameraModule, Any, str]:
+        with _composed([*overrides, *self._data, f"seed={seed}", "threads=1"]) as composed:
+            cfg = checked(composed)
+            settings = RunSettings.of(cfg)
+            lightning.seed_everything(seed, workers=True, verbose=False)
+            module = instantiate(settings.module)(lens=build_lens(settings))
+            return module, instantiate(settings.data), cfg.score
+
+
+def _steps(count: int) -> tuple[str, str]:
+    return f"data.steps_per_epoch={count}", "trainer.max_epochs=1"
+
+
+def _trainer(steps: int) -> lightning.Trainer:
+    return lightning.Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        limit_train_batches=steps,
+    )
+
+
+def _fit(module: CameraModule, data: Any, steps: int) -> float:
+    """Train, without validation, and return the process seconds."""
+    trainer = _trainer(steps)
+    trainer.limit_val_batches = 0
+    begun = time.process_time()
+    trainer.fit(module, data)
+    return time.process_time() - begun
+
+
+@contextmanager
+def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
+    with initialize_config_dir(str(_ROOT / "conf"), version_base="1.3"):
+        cfg = compose(
+            "train", [*overrides, "hydra.run.dir=outputs/co_designs"], return_hydra_config=True
+        )
+        HydraConfig.instance().set_config(cfg)
+        yield cfg
