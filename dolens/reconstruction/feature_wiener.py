@@ -59,6 +59,10 @@ class DeconvolvedRestoration(Restoration):
         """Return further channels (B, C, H, W) for the network; none here."""
         return []
 
+    def filtered(self, raw: Tensor, point_spread_functions: Tensor) -> Tensor:
+        """Return e, the pictures (B, 3, H, W) of the deconvolution alone, sRGB-encoded."""
+        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions))[:, 0]
+
     def forward(
         self,
         raw: Tensor,

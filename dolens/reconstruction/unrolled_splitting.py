@@ -79,6 +79,10 @@ class UnrolledSplittingRestoration(Restoration):
             for _ in range(stages + 1)
         )
 
+    def filtered(self, raw: Tensor, point_spread_functions: Tensor) -> Tensor:
+        """Return the pictures (B, 3, H, W) of the first deconvolution alone, sRGB-encoded."""
+        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions))[:, 0]
+
     def forward(
         self,
         raw: Tensor,

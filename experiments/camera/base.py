@@ -74,6 +74,17 @@ class Camera(Experiment):
         restored = restored.to(self.network.dtype)
         return restored.unflatten(0, taken.raw.shape[:2])
 
+    def filtered(self, taken: Views, functions: Tensor | None) -> Tensor | None:
+        """Return pictures (B, V, 3, H, W) by the network's linear filter alone, display-encoded.
+
+        None where it has none: what a network of one's own adds to its filter is then not known.
+        """
+        alone = getattr(self.network, "filtered", None)
+        if alone is None or functions is None:
+            return None
+        pictures = alone(taken.raw.flatten(0, 1), functions)
+        return pictures.unflatten(0, taken.raw.shape[:2])
+
     def loss_over_views(
         self, restored: Tensor, truth: Tensor, shared: bool = False
     ) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """Training and evaluation of a camera."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -33,6 +34,7 @@ from dolens.experiments.camera.made_lens_scores import (
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
+from dolens.experiments.camera.restoration_gain import gain_line, gain_numbers
 from dolens.experiments.camera.settings import Reconstruction, Training
 from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
@@ -41,6 +43,8 @@ from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
 from dolens.stages import stage as named_stage
 
+logger = logging.getLogger(__name__)
+
 # Beside the scores.
 _METRICS = (
     "train/loss",
@@ -48,6 +52,7 @@ _METRICS = (
     "train/*",
     "test*/photographs",
     "test*/crops",
+    "test*/gain_over_*",
     "error/test*",
     "variables/*",
     "operand/*",
@@ -334,6 +339,9 @@ class CameraModule(Camera):
             with named_stage("lenses as built"):
                 self.made_scores = made_lens_scores(self, self.manufacture, crops, of)
 
+        if "test" in self.test_scores:
+            logger.info("%s", gain_line(self.test_scores["test"]))
+
     def _log_evaluations(self) -> None:
         found = self.evaluation.scores(self.trainer, self.views.labels())
         for stage, scores in found.items():
@@ -348,7 +356,7 @@ class CameraModule(Camera):
         """Return the variables, intervals of scores, and costs."""
         numbers = {n: float(v) for n, v in variable_numbers(self.variables()).items()}
         for stage, scores in self.test_scores.items():
-            numbers |= scores.numbers(stage)
+            numbers |= scores.numbers(stage) | gain_numbers(scores, stage)
         numbers["network/pretrained"] = float(self.network.pretrained)
         if hasattr(self.loss, "perceptual_available"):  # a loss of a user's own may know no such
             numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)

@@ -52,7 +52,11 @@ class Evaluation:
             if reference is not None:
                 self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
             name = stage if reference is None else f"{stage}_{reference}"
-            self._add(name, index, _row(camera, taken, camera.restore(taken, functions)))
+            row = _row(camera, taken, camera.restore(taken, functions))
+            filtered = camera.filtered(taken, functions) if stage == "test" else None
+            if filtered is not None:
+                row["linear_psnr_db"] = _compared(psnr_db, filtered.clamp(0.0, 1.0), taken.truth)
+            self._add(name, index, row)
             if reference is None and stage == "test" and functions is not None:
                 self._miscalibrated(camera, values, taken, functions, index)
 
@@ -112,6 +116,8 @@ class Evaluation:
                     f"{stage}/loss",
                     *(f"{stage}/{s}{view}" for s in scores for view in views),
                 ]
+        if hasattr(camera.network, "filtered"):
+            found += [f"test{judge}/linear_psnr_db{view}" for judge in judges for view in views]
         if camera.network.needs_point_spread_function:
             wrong = [f"psnr_db_miscalibrated/{kind}" for kind in self.miscalibrations]
             found += [f"test/{name}{view}" for name in wrong for view in views]

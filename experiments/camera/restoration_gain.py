@@ -1,0 +1,71 @@
+"""The gain of restored images over simpler pictures of the same photographs, with its interval."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+
+from dolens.experiments.camera.photograph_scores import (
+    PhotographScores,
+    format_interval,
+    statistics_of,
+)
+from dolens.reconstruction.intervals import Interval, gain_interval
+
+# Gains by their names: over which scores of the same test they are, and what those are of.
+OVER = {
+    "gain_over_filter_db": ("linear_psnr_db", "the network's own linear filter"),
+    "gain_over_raw_db": ("raw_psnr_db", "the sensor's image"),
+}
+
+
+class RestorationGain(NamedTuple):
+    """The PSNR of restored images less that of simpler pictures, dB.
+
+    Attributes:
+        name: in `OVER`.
+        view: its label, `worst`, or empty for the mean.
+        interval: 95 %, over photographs, paired.
+    """
+
+    name: str
+    view: str
+    interval: Interval
+
+
+def restoration_gains(scores: PhotographScores) -> Iterator[RestorationGain]:
+    """Yield the gains of one test, for the mean over the views, each view, and the worst.
+
+    At the worst view the gain is that of the worst view of either: they may be two.
+    """
+    for name, (other, _) in OVER.items():
+        if other not in scores.metrics:
+            continue
+        sides = [scores.metrics[metric].double()[None] for metric in ("psnr_db", other)]
+        for view, statistic in statistics_of(scores.views).items():
+            interval = gain_interval(*sides, statistic, torch.Generator().manual_seed(0))
+            yield RestorationGain(name, view, interval)
+
+
+def gain_numbers(scores: PhotographScores, stage: str) -> dict[str, float]:
+    """Return gains and the ends of their intervals, by the names of metrics."""
+    numbers = {}
+    for gain in restoration_gains(scores):
+        key = f"{stage}/{gain.name}" + (f"/{gain.view}" if gain.view else "")
+        found = gain.interval
+        numbers |= {key: found.estimate}
+        numbers |= {f"error/{key}/low": found.low, f"error/{key}/high": found.high}
+    return numbers
+
+
+def gain_line(scores: PhotographScores) -> str:
+    """Return a sentence that says the gains at the worst view, with their intervals."""
+    said = [
+        f"{format_interval(gain.interval, 2)} dB over {OVER[gain.name][1]}"
+        for gain in restoration_gains(scores)
+        if gain.view == "worst"
+    ]
+    return (
+        f"Restored images at the worst of {', '.join(scores.views)}: {'; '.join(said)} "
+        f"({len(scores.photographs)} photographs, 95 % intervals)"
+    )

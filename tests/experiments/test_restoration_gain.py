@@ -1,0 +1,61 @@
+"""What a run says that its restoration gains, with intervals."""
+
+import json
+import logging
+
+import pytest
+import torch
+
+from dolens.experiments.camera.photograph_scores import PhotographScores
+from dolens.experiments.camera.restoration_gain import gain_line, gain_numbers
+from dolens.experiments.running.training import run
+from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
+
+
+def scores(restored, raw, linear=None) -> PhotographScores:
+    metrics = {"psnr_db": torch.tensor(restored), "raw_psnr_db": torch.tensor(raw)}
+    if linear is not None:
+        metrics["linear_psnr_db"] = torch.tensor(linear)
+    names = tuple(f"photograph {n}" for n in range(len(restored)))
+    return PhotographScores(names, (1,) * len(names), ("near", "far"), metrics)
+
+
+def test_a_gain_that_every_photograph_has_is_certain():
+    """Photographs differ by 10 dB, and the gain by nothing: intervals are paired."""
+    raw = [[20.0, 21.0], [25.0, 26.0], [30.0, 31.0]]
+    numbers = gain_numbers(scores([[a + 2.0, b + 3.0] for a, b in raw], raw), "test")
+    assert numbers["test/gain_over_raw_db/near"] == pytest.approx(2.0)
+    assert numbers["error/test/gain_over_raw_db/near/low"] == pytest.approx(2.0, abs=1e-6)
+    assert numbers["error/test/gain_over_raw_db/near/high"] == pytest.approx(2.0, abs=1e-6)
+    assert numbers["test/gain_over_raw_db"] == pytest.approx(2.5)
+    assert not any("gain_over_filter" in name for name in numbers)
+
+
+def test_at_the_worst_view_each_side_has_its_own():
+    """Raw images are worst far away, restored ones nearby."""
+    found = scores([[24.0, 26.0], [24.0, 26.0]], [[22.0, 20.0], [22.0, 20.0]])
+    numbers = gain_numbers(found, "test")
+    assert numbers["test/gain_over_raw_db/worst"] == pytest.approx(4.0)
+
+
+def test_a_gain_that_photographs_disagree_about_has_a_wide_interval():
+    found = scores([[24.0, 24.0], [20.0, 20.0]], [[20.0, 20.0], [22.0, 22.0]], [[23.0] * 2] * 2)
+    numbers = gain_numbers(found, "test")
+    assert numbers["error/test/gain_over_raw_db/worst/low"] < 0.0
+    assert numbers["error/test/gain_over_raw_db/worst/high"] > 0.0
+    assert "over the network's own linear filter; " in gain_line(found)
+
+
+def test_a_run_says_its_gain(composed, tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        run(composed("experiment=wavefront_coding", *TINY, *TINY_NETWORK))
+    (said,) = [r.message for r in caplog.records if r.message.startswith("Restored images")]
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    for name in ("gain_over_filter_db", "gain_over_raw_db"):
+        gain = metrics[f"test/{name}/worst"]
+        assert f"{gain:+.2f}" in said
+        assert metrics[f"error/test/{name}/worst/low"] <= gain
+    linear = metrics["test/linear_psnr_db/worst"]
+    assert metrics["test/gain_over_filter_db/worst"] == pytest.approx(
+        metrics["test/psnr_db/worst"] - linear, abs=1e-4
+    )
