@@ -184,7 +184,7 @@ def test_patches_of_light_are_as_narrow_as_rays_are_dense():
         image, torch.ones_like(image, dtype=torch.bool), 0.0, Sensor(32, 32, 0.1)
     )
     assert float(measured.lit_pixels) == pytest.approx(100.0)
-    for rays, widened, expected in ((100_000, 1.0, 16), (10_000, 1.0, 6), (10_000, 2.0, 3)):
+    for rays, widened, expected in ((100_000, 1.0, 21), (10_000, 1.0, 6), (10_000, 2.0, 3)):
         imager = spot_imager(
             measured, 622.5, {"rays": rays, "subpixels": "auto", "reach": 1.25}, widened=widened
         )
