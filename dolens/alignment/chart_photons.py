@@ -95,7 +95,7 @@ def photographed(
     for mark, place in enumerate(chart.centres()):
         aim = _aim(chart, camera, light.wavelengths[0], place, generator)
         for photograph, plane in enumerate(camera.planes):
-            wanted = int(torch.poisson(torch.tensor(light.photons), generator))
+            wanted = int(torch.poisson(torch.tensor(float(light.photons)), generator))
             x, y = _landing(chart, camera, light, place, plane, aim, wanted, generator)
             column, row = (
                 ((at - corners[photograph, mark, axis]) / pitch).round().long()

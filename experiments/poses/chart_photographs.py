@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
 from dolens.alignment.chart import Chart
 from dolens.alignment.chart_fit import ChartFit, Prior, fit_chart
@@ -159,7 +158,6 @@ class ChartPhotographsModule(Analysis):
     @torch.no_grad()
     def analyse(self) -> dict[str, float]:
         """Fit the photographs, or draw cameras and fit theirs."""
-        self.designed = self.model.designed
         if self.photographs is not None:
             with named_stage("photographs and their fit"):
                 seen = read_windows(self.photographs, self.model, self.prior, self.windows.search)
@@ -201,7 +199,7 @@ class ChartPhotographsModule(Analysis):
         truth = torch.full_like(fit.numbers, torch.nan) if specimen is None else specimen.truth
         pictures: Judged | None = None
         if specimen is not None and number <= self.restoration.specimens:
-            numbers = {"design": self.designed_camera, "fitted": fit.numbers}
+            numbers = {"design": self.prior.mean, "fitted": fit.numbers}
             pictures = judged(
                 self.model,
                 self.restoration,
@@ -218,11 +216,6 @@ class ChartPhotographsModule(Analysis):
             fit.degrees_of_freedom,
             seconds,
         )
-
-    @property
-    def designed_camera(self) -> Tensor:
-        """Return the camera as designed, with the blur that is expected of it."""
-        return self.prior.mean
 
     def _fit(self, model: ChartModel, seen: MarkWindows, prior: Prior) -> ChartFit:
         rays = model.rays
@@ -283,7 +276,7 @@ class ChartPhotographsModule(Analysis):
         """
         first = self.found[0]
         return {
-            "prescription": prescription_rows(self.designed, first),
+            "prescription": prescription_rows(self.prior.mean, first),
             "combinations": combination_rows(first.fit),
             "cameras": specimen_rows(self.found) if self._known else [],
             "restored": gain_rows(self.found) if self._known else [],
