@@ -76,7 +76,7 @@ class MarkWindows:
         if bool(faint.any()):
             photograph, mark = (int(i) + 1 for i in torch.nonzero(faint)[0])
             raise InputError(
-                f"search: photograph {photograph} shows no mark {mark} where it is looked for; "
+                f"search_radius: photograph {photograph} shows no mark {mark} where one is; "
                 "allowed: windows that hold each mark, see chart and planes"
             )
         light = torch.where(smooth > _BRIGHT * peak[..., None, None], smooth, 0.0)
@@ -100,7 +100,9 @@ class MarkWindows:
             room = torch.minimum(about - middles.amin(-1), middles.amax(-1) - about)
             if bool((room < _REACH * width).any()):
                 need = float((_REACH * width - room).max())
-                raise InputError(f"search: a mark lies {need:.3g} mm too near its window's edge")
+                raise InputError(
+                    f"search_radius: a mark lies {need:.3g} mm too near its window's edge"
+                )
         x, y = self.x - centre[..., :1], self.y - centre[..., 1:]
         along, down = weights_on_grid(x, y, width, highest)
         counts = ((down @ self.counts) * along).sum(-1)

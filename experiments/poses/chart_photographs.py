@@ -160,7 +160,9 @@ class ChartPhotographsModule(Analysis):
         """Fit the photographs, or draw cameras and fit theirs."""
         if self.photographs is not None:
             with named_stage("photographs and their fit"):
-                seen = read_windows(self.photographs, self.model, self.prior, self.windows.search)
+                seen = read_windows(
+                    self.photographs, self.model, self.prior, self.windows.search_radius
+                )
                 self._fitted(1, seen, None)
         else:
             for number in range(1, self.cameras + 1):
@@ -184,7 +186,7 @@ class ChartPhotographsModule(Analysis):
             self.seed,
             number,
         )
-        seen = simulated(self.model, self.prior, specimen, self.light, self.windows.search)
+        seen = simulated(self.model, self.prior, specimen, self.light, self.windows.search_radius)
         self._fitted(number, seen, specimen)
 
     def _fitted(self, number: int, seen: MarkWindows, specimen: Specimen | None) -> None:

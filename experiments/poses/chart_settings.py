@@ -134,11 +134,11 @@ class Windows:
 
     Attributes:
         pixel_pitch: of simulated photographs, mm.
-        search: how far from where the design has it a mark is looked for, mm.
+        search_radius: how far from where the design has it a mark is looked for, mm.
     """
 
     pixel_pitch: float
-    search: float
+    search_radius: float
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
