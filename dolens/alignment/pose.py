@@ -119,7 +119,7 @@ class Pose(DesignVariables):
         """Return the image of every source on every plane of the sensor, a source's together.
 
         Args:
-            imager: makes the images.
+            imager: makes the images, each with its own patches of light where it has some.
             scaled: u (P,), in place of the stored one.
         """
         values = self(scaled)
@@ -128,7 +128,8 @@ class Pose(DesignVariables):
         systems = [
             self.lens.system({**own, "sensor_distance": distance + plane}) for plane in self.planes
         ]
-        return [imager.image(s, source) for source in self._placed(values) for s in systems]
+        pairs = [(s, source) for source in self._placed(values) for s in systems]
+        return [imager.for_image(n).image(*pair) for n, pair in enumerate(pairs)]
 
     def _placed(self, values: Mapping[str, Tensor]) -> list[Tensor]:
         """Return the sources, (3,) each, mm."""

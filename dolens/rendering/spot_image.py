@@ -5,7 +5,7 @@ lens moves its light moves with it, smoothly.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -66,6 +66,7 @@ class SpotImager:
         subpixels: along each side of a pixel; see `bin_rays`.
         seed: turns the pattern of rays.
         rays_at_a_time: bounds memory.
+        subpixels_of: of each image of a series, in the place of `subpixels`; see `for_image`.
 
     Raises:
         InputError: a number out of range.
@@ -79,6 +80,7 @@ class SpotImager:
     subpixels: int = 2
     seed: int = 0
     rays_at_a_time: int = 1 << 17
+    subpixels_of: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         for name, low in (("rays", 1), ("subpixels", 1), ("rays_at_a_time", 1)):
@@ -88,6 +90,15 @@ class SpotImager:
             raise InputError(f"imager.rim: {self.rim}; allowed: above 0 and below 1")
         if not self.reach > 1.0:
             raise InputError(f"imager.reach: {self.reach}; allowed: above 1")
+
+    def for_image(self, number: int) -> "SpotImager":
+        """Return what makes one image of a series, with patches of its own.
+
+        The same rays are dense in an image near focus, and far apart in one that is defocused.
+        """
+        if self.subpixels_of is None:
+            return self
+        return replace(self, subpixels=self.subpixels_of[number], subpixels_of=None)
 
     def image(self, system: OpticalSystem, source: Tensor) -> SpotImage:
         """The image of a point source.

@@ -1,6 +1,7 @@
 """An iteration of a pose fit moves its variables by the optimizer of the stage."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -36,7 +37,8 @@ def loss_of(
         slopes, blur = slopes_of(stage, measurement, wavelength, imager)
         return NoiseWeightedLoss(measurement, own, slopes, blur)
     weight = centroid_weight if stage.centroid_weight is None else stage.centroid_weight
-    return SpotLoss(measurement, own, weight, stage.blur or 0.0)
+    # From afar an image near focus is found by wide patches, those of the widest image.
+    return SpotLoss(measurement, replace(own, subpixels_of=None), weight, stage.blur or 0.0)
 
 
 def slopes_of(

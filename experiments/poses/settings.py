@@ -16,7 +16,7 @@ from dolens.typed_values import call_with_settings, check_type
 OPTIMIZERS = ("adam", "dls")
 LOSSES = ("s21", "noise_weighted")
 AUTO = "auto"
-_SPACINGS, _FINEST = 1.2, 16
+_SPACINGS, _FINEST = 1.2, 128
 # Derivatives are differences of what crosses a pixel's edges: by so much wider are their patches.
 _SLOPES_WIDENED = 2.0
 _RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
@@ -200,6 +200,7 @@ def spot_imager(
 
     `subpixels: auto` makes a ray's patch of light 1.2 times as wide as rays are apart where the
     measured light is: narrower ones let the rays' pattern show as moiré, wider ones blur rims.
+    Each image of a measurement has patches of its own, for near focus the same rays are denser.
 
     Args:
         measurement: its sensor, and how many pixels its light covers.
@@ -213,8 +214,9 @@ def spot_imager(
     imager, auto = plain_imager(measurement.sensor, wavelength, *settings)
     if not auto:
         return imager
-    finest = int(_rays_a_pixel(measurement, imager) ** 0.5 / (_SPACINGS * widened))
-    return replace(imager, subpixels=min(max(finest, 1), _FINEST))
+    density = imager.rays / imager.reach**2 / measurement.lit_pixels
+    finest = (density.sqrt() / (_SPACINGS * widened)).int().clamp(1, _FINEST).tolist()
+    return replace(imager, subpixels=min(finest), subpixels_of=tuple(finest))
 
 
 def slopes_imager(

@@ -154,6 +154,7 @@ def test_what_a_run_cannot_do_is_one_clear_line(own, case):
 @pytest.mark.parametrize(
     "experiment",
     [
+        "chart_photographs",
         "cooke_sensitivity",
         "misalignment_coverage",
         "pose_accuracy",

@@ -184,7 +184,7 @@ def test_patches_of_light_are_as_narrow_as_rays_are_dense():
         image, torch.ones_like(image, dtype=torch.bool), 0.0, Sensor(32, 32, 0.1)
     )
     assert float(measured.lit_pixels) == pytest.approx(100.0)
-    for rays, widened, expected in ((100_000, 1.0, 16), (10_000, 1.0, 6), (10_000, 2.0, 3)):
+    for rays, widened, expected in ((100_000, 1.0, 21), (10_000, 1.0, 6), (10_000, 2.0, 3)):
         imager = spot_imager(
             measured, 622.5, {"rays": rays, "subpixels": "auto", "reach": 1.25}, widened=widened
         )
@@ -192,6 +192,13 @@ def test_patches_of_light_are_as_narrow_as_rays_are_dense():
         assert imager.subpixels == expected
     assert spot_imager(measured, 622.5, {"subpixels": "auto"}, {"subpixels": 3}).subpixels == 3
     assert spot_imager(measured, 622.5, {"rays": 10, "subpixels": "auto"}).subpixels == 1
+    # An image of four pixels has patches a fifth as wide: √(10 000/1.5625/4)/1.2 = 33.3.
+    small = torch.zeros_like(image)
+    small[0, 10:12, 10:12] = 7.0
+    images = torch.cat([image, small])
+    both = Measurement(images, torch.ones_like(images, dtype=torch.bool), 0.0, measured.sensor)
+    imager = spot_imager(both, 622.5, {"rays": 10_000, "subpixels": "auto", "reach": 1.25})
+    assert [imager.for_image(number).subpixels for number in (0, 1)] == [6, 33]
     # 64 and 640 rays a pixel: √((450/64 - 1)/4π) pixels, and none.
     for rays, expected in ((10_000, 0.6928), (100_000, 0.0)):
         imager = spot_imager(measured, 622.5, {"rays": rays, "reach": 1.25})

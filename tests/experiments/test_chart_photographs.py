@@ -1,0 +1,152 @@
+"""A camera's prescription from photographs of a chart, as a run: tables, metrics, files."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hydra.errors import InstantiationException
+from PIL import Image
+from tiny_experiment import figure_names
+
+import dolens
+from dolens.alignment.chart import Chart
+from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
+from dolens.experiments.running.training import run
+from dolens.optics.elements import Element
+from dolens.sensor.pixels import Sensor
+
+PITCH = 0.0069
+SMALL = [
+    "experiment=chart_photographs",
+    "chart.rows=2",
+    "planes=[2.4,2.8]",
+    "pixel_pitch=0.0069",
+    "module.pupil.rings=4",
+    "module.pupil.arms=12",
+    "+trainer.enable_progress_bar=false",
+    "~lens.elements.front",
+    "~lens.elements.rear",
+]
+SIMULATED = [
+    *SMALL,
+    "chart.columns=3",
+    "chart.pitch=150",
+    "photons=10000",
+    "cameras=2",
+    "subsets=[1]",
+    "restoration.specimens=1",
+    "restoration.fields=[[0,0],[9,6]]",
+    "restoration.photons=20000",
+    "restoration.size=33",
+    "restoration.crop=96",
+]
+
+
+def table(folder, name):
+    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_drawn_cameras_are_fitted_and_their_scenes_restored(composed, tmp_path):
+    run(composed(*SIMULATED))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["fit/cameras"] == 2.0
+    assert 0.6 < metrics["fit/chi_squared_per_freedom"] < 1.6
+    assert metrics["coverage/all/within_2"] > 0.8
+    assert metrics["gain/share"] > 0.5
+    rows = table(folder, "prescription")
+    # 4 poses, 2 gaps, the sensor's distance; 4 of its pose, 6 of the chart, size, blur, 2 planes.
+    assert len(rows) == 21
+    for row in rows:
+        name, found = row["parameter"], float(row["found"])
+        share = float(row["error_over_prior"])
+        assert float(row["low_95"]) < found < float(row["high_95"])
+        assert 0.0 < share <= 1.0 + 1e-6
+        assert metrics[f"error_over_prior/{name}/2_photographs"] == pytest.approx(share, rel=1e-6)
+        assert name.startswith("planes.2") or f"error_over_prior/{name}/1_photographs" in metrics
+    assert len(table(folder, "cameras")) == 2 * 21
+    assert len(table(folder, "restored")) == 2
+    combinations = table(folder, "combinations")
+    # A sensor farther away is no other than planes that are.
+    assert float(combinations[0]["error_over_prior"]) == pytest.approx(1.0, abs=1e-3)
+    assert figure_names(folder) == {"marks", "intervals", "coverage", "restoration"}
+    final = dolens.load_lens(folder / "lens/final.yaml", dtype=torch.float64)
+    found = {row["parameter"]: float(row["found"]) for row in rows}
+    assert float(final.thicknesses["2"]) == pytest.approx(found["thicknesses.2"], abs=1e-6)
+    tilt = float(final.elements["middle"].tilt_x.detach())
+    assert math.degrees(tilt) == pytest.approx(found["elements.middle.tilt_x"], abs=1e-6)
+
+
+def test_photographs_in_files_give_the_prescription(composed, tmp_path):
+    """Files of 16 bits, upright as a viewer shows them, of a lens whose gap is 30 µm too wide."""
+    chart = Chart(1000.0, 2, 2, 60.0, 0.2)
+    lens = dolens.load_lens("conf/lens/cooke_triplet.yaml", dtype=torch.float64)
+    lens.elements["middle"] = Element(3, 4)
+    lens.requires_grad_(False)
+    lens.thicknesses["2"].add_(0.03)
+    lens.elements["middle"].tilt_x.fill_(math.radians(0.1))
+    camera = TrueCamera(lens, (0.0,) * 4, (1.0, -0.5, 0.0, 0.0, 0.0, 0.0), 0.0, 2e-6, (2.4, 2.8))
+    sensor = Sensor(720, 760, PITCH)
+    entries = []
+    for number, plane in enumerate(camera.planes):
+        # One window that is the sensor: columns of the file run along -x.
+        extent = (sensor.width - 1) * PITCH, (sensor.height - 1) * PITCH
+        corner = torch.tensor([-0.5 * extent[0], -0.5 * extent[1]], dtype=torch.float64)
+        side = sensor.width
+        one = TrueCamera(*list(vars(camera).values())[:5], (plane,))
+        counts = photographed(
+            chart,
+            one,
+            ChartLight(2e4, 2.0, 2.0, (587.5618,)),
+            corner.expand(1, chart.count, 2),
+            side,
+            PITCH,
+            torch.Generator().manual_seed(number),
+        ).counts[0]
+        # Backgrounds of the four windows are summed: 8 electrons, and read noise of 4.
+        whole = counts.sum(0)[: sensor.height].flip(-1)
+        path = tmp_path / f"{number}.png"
+        Image.fromarray((whole + 100.0).clamp(min=0.0).round().numpy().astype(np.uint16)).save(path)
+        entries.append(f"{{path: {path}, pixel_pitch: {PITCH}, dark_level: 100, read_noise: 4.0}}")
+    given = f"photographs=[{','.join(entries)}]"
+    run(composed(*SMALL, "chart.columns=2", "chart.pitch=60", "subsets=[]", given))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert 0.5 < metrics["fit/chi_squared_per_freedom"] < 1.6
+    assert not [name for name in metrics if name.startswith("coverage")]
+    rows = {row["parameter"]: row for row in table(folder, "prescription")}
+    for name, true in (
+        ("thicknesses.2", float(lens.thicknesses["2"])),
+        ("elements.middle.tilt_x", 0.1),
+        ("chart.x", 1.0),
+        ("chart.y", -0.5),
+    ):
+        row = rows[name]
+        assert "true" not in row
+        error = float(row["standard_error"])
+        assert abs(float(row["found"]) - true) < 4.0 * error, name
+        assert error < 0.7 * float(row["prior_deviation"]), name
+    assert figure_names(folder) == {"marks", "intervals"}
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("photographs=[{path: a.png, pixel_pitch: 0.0069}]", "photographs: 1 are given"),
+        ("chart.shape=star", "chart.shape"),
+        ("chart.size=200", "chart.size: 200"),
+        ("camera.blur=0", "camera.blur: 0"),
+        ("unmodelled.mark_size=2", "unmodelled.mark_size: 2"),
+        ("restoration.size=64", "restoration.size: 64"),
+        ("subsets=[5]", "subsets: 5; allowed: from 1 to 2"),
+        ("photons=0", "photons: 0"),
+        ("search_radius=0", "search_radius: 0"),
+    ],
+)
+def test_what_is_wrong_is_named(override, message, composed):
+    with pytest.raises((InstantiationException, dolens.errors.InputError), match=message):
+        run(composed(*SIMULATED, override))
