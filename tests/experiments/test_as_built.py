@@ -108,6 +108,8 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
         "elements.plate.decenter_[xy]": 0.2,
         "surfaces.[123].curvature": {"half_range": 0.01, "relative": True},
         "thicknesses.[1234]": 0.1,
+        "media.[124].index_offset": 5e-4,
+        "surfaces.*.astigmatism_*": 2e-4,
     }
     settings = AsBuilt(calibration="own")
     batch = textures(1).double()
