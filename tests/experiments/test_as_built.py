@@ -40,7 +40,7 @@ def textures(count=2, side=24 + 32):
 
 
 def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
-    run(composed(*AS_BUILT))
+    run(composed(*AS_BUILT, "as_built.judged_factors=[3]"))
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     with (tmp_path / "run/made_lenses.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -57,6 +57,19 @@ def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
     assert max(abs(float(row["surfaces.2.curvature (%)"])) for row in rows) <= 1.0
     assert (tmp_path / "run/figures/made_lenses.png").stat().st_size > 5000
     assert metrics["train/loss"] > 0.0
+    with (tmp_path / "run/made_crops.csv").open() as file:
+        crops = list(csv.DictReader(file))
+    views = [name for name in crops[0] if name.startswith("psnr_db/")]
+    for factor, column in (("1", "made"), ("3", "made/factor_3")):
+        of = [r for r in crops if r["factor"] == factor]
+        means = []
+        for lens in map(str, range(5)):
+            table = [[float(r[view]) for view in views] for r in of if r["lens"] == lens]
+            means.append(min(sum(c) / len(c) for c in zip(*table, strict=True)))
+        assert metrics[f"{column}/psnr_db/worst_decile"] == pytest.approx(min(means), rel=1e-6)
+    # The same camera, whatever it is judged by.
+    drawn = "psnr_db/as_drawn"
+    assert metrics[f"made/{drawn}"] == metrics[f"made/factor_3/{drawn}"]
 
 
 def test_crops_are_of_as_many_photographs_as_there_are():
@@ -77,6 +90,14 @@ def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
     torch.testing.assert_close(taken.truth, drawn.truth, rtol=0.0, atol=1e-4)
     for part in own:
         torch.testing.assert_close(part, functions, rtol=0.0, atol=1e-6)
+
+
+def test_errors_at_another_factor_are_in_proportion(camera):
+    module = camera("as_built.factor=2")
+    design = module.variables()
+    wide = module.manufacture.at_factor(6.0)
+    one, other = (m.tested(module.lens, design, 3).errors for m in (module.manufacture, wide))
+    torch.testing.assert_close(other, 3.0 * one)
 
 
 def test_each_lens_has_its_part_of_the_batch(camera):
@@ -195,7 +216,8 @@ def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
     worst = torch.arange(1.0, 31.0, dtype=torch.float64)
     scores = MadeLensScores(
         ("a", "b"),
-        torch.stack([worst, worst + 5.0], 1),
+        torch.stack([worst, worst + 5.0], 1)[:, None].expand(-1, 3, -1),
+        ("cat", "cat", "dog"),
         torch.tensor([20.0, 30.0]),
         torch.zeros(30, len(module.manufacture.tolerances.names)),
         module.manufacture.tolerances,
@@ -215,6 +237,7 @@ def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
         ("as_built.lenses_per_step=0", "as_built.lenses_per_step"),
         ("as_built.electrons=-1", "as_built.electrons"),
         ("as_built.tested=-1", "as_built.tested"),
+        ("as_built.judged_factors=[0]", "as_built.judged_factors"),
         ("+tolerances={surfaces.9.curvature: 0.1}", "surfaces.9.curvature"),
     ],
 )
