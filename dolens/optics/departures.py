@@ -28,15 +28,13 @@ from dolens.optics.materials import is_glass
 from dolens.optics.mirrors import MIRROR
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.even_asphere import EvenAsphere
+from dolens.optics.surfaces.irregular import ASTIGMATIC, Irregular
 from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
-from dolens.optics.surfaces.zernike import ZernikeFringe
 
 INDEX_OFFSET = "index_offset"
 ASTIGMATISMS = ("astigmatism_0", "astigmatism_45")
-# Their fringe terms.
-_TERMS = ("z5", "z6")
 _ROUND = (Plane, Sphere, Conic, EvenAsphere)
 
 
@@ -109,8 +107,8 @@ def irregular(surface: SurfaceState, given: Mapping[str, Tensor]) -> SurfaceStat
         return replace(surface, parameters={**stored, **own})
     conic = {"curvature": zero, "conic": zero, **stored}
     disc = {"normalization_radius": radius, "decenter_x": zero, "decenter_y": zero}
-    terms = dict(zip(_TERMS, (a, b), strict=True))
-    return replace(surface, shape=ZernikeFringe, parameters={**conic, **terms, **disc})
+    terms = dict(zip(ASTIGMATIC, (a, b), strict=True))
+    return replace(surface, shape=Irregular, parameters={**conic, **terms, **disc})
 
 
 def astigmatism_of(lens: Any, number: str, values: dict[str, Tensor]) -> dict[str, Tensor]:

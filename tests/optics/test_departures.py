@@ -10,6 +10,7 @@ from dolens.optics.departures import departures
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.surfaces.zernike import ZernikeFringe
 from dolens.prescriptions.build import lens_from_prescription
 
 BACKENDS = ("reference", "cpu")
@@ -167,3 +168,18 @@ def test_light_that_a_mirror_returns_is_in_the_same_glass(root):
         for a, b in zip(system.indices(wave), lens.system().indices(wave), strict=True)
     ]
     assert sum(shift != 0.0 for shift in shifts) > len(names)
+
+
+def test_an_irregular_surface_is_a_zernike_surface_in_all_but_speed():
+    lens = singlet().requires_grad_(False)
+    values = {"surfaces.2.astigmatism_0": number(3e-4), "surfaces.2.astigmatism_45": number(2e-4)}
+    surface = lens.system(values).surfaces[1]
+    own, known = surface.parameters, ZernikeFringe
+    assert issubclass(surface.shape, known) and surface.shape is not known
+    x, y = torch.linspace(-6.0, 6.0, 7).double(), torch.linspace(5.0, -4.0, 7).double()
+    pairs = zip(surface.shape.added_terms(own, x, y), known.added_terms(own, x, y), strict=True)
+    for found, expected in pairs:
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-18)
+    for name in ("paraxial_curvature", "fourth_order_departure"):
+        found, expected = (getattr(shape, name)(own) for shape in (surface.shape, known))
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=0.0)
