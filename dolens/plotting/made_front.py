@@ -1,7 +1,9 @@
 """This module draws how good a series of lenses is by how wide its tolerances are."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 
@@ -42,5 +44,6 @@ def made_front_figure(
     return figure
 
 
-def _reciprocal(value: float) -> float:
-    return 1.0 / value
+def _reciprocal(value: Any) -> Any:
+    # Matplotlib asks at zero too, of an axis that has none.
+    return 1.0 / np.maximum(value, 1e-9)
