@@ -123,8 +123,8 @@ class TolerancesModule(Analysis):
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
         for name in filter(names_departures, self.tolerances.names):
             raise InputError(
-                f"tolerances.{name}: allowed here: parameters of the lens, with respect to which rays "
-                "have derivatives; a camera's made lenses may have this error"
+                f"tolerances.{name}: allowed here: parameters of the lens, which rays have "
+                "derivatives by; a camera's made lenses may have this error"
             )
         self.monte_carlo = monte_carlo
         self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
