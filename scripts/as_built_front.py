@@ -6,9 +6,9 @@
 A run is the folder of a camera with `as_built.judged_factors`; the runs of an arm are its seeds,
 in the same order for all arms.  The first arm is what the others are compared with.  For each
 factor a row gives, as means over seeds: the lens as drawn; the mean of the lenses made; their worst
-tenth, with its interval; and what the arm wins there, with an interval of 95 % over lenses,
-photographs and seeds, all paired.  Then, for each factor, at how wide tolerances the first arm has
-the same worst tenth.
+tenth, with an interval of 95 % over lenses and seeds for these crops; and what the arm wins there,
+with an interval over lenses, photographs and seeds, all paired.  Then, for each factor, at how wide
+tolerances the first arm has the same worst tenth.
 """
 
 import argparse
@@ -80,25 +80,26 @@ def worst_tenth(scores: Tensor) -> Tensor:
     return worst[:, : math.ceil(0.1 * worst.shape[1] - 1e-9)].mean()
 
 
-def resampled(arms: Sequence[Tensor], photograph: Tensor) -> Tensor:
-    """Return the worst tenths of arms, (resamples, arms), over lenses, photographs and seeds.
+def resampled(arms: Sequence[Tensor], photograph: Tensor | None) -> Tensor:
+    """Return the worst tenths of arms, (resamples, arms), over lenses, seeds and photographs.
 
     All arms are drawn alike: they share lenses, photographs and seeds.
 
     Args:
         arms: (S, N, B, V) of each.
-        photograph: number of the photograph of each crop.
+        photograph: number of the photograph of each crop; None: the crops stay the same.
     """
     generator = torch.Generator().manual_seed(0)
-    count = int(photograph.max()) + 1
+    seeds, lenses, b = arms[0].shape[0], arms[0].shape[1], torch.arange(arms[0].shape[2])
+    count = 0 if photograph is None else int(photograph.max()) + 1
     crops = [torch.nonzero(photograph == p)[:, 0] for p in range(count)]
-    seeds, lenses = arms[0].shape[:2]
     found = []
     for _ in range(_RESAMPLES):
         s = torch.randint(seeds, (seeds,), generator=generator)
         n = torch.randint(lenses, (lenses,), generator=generator)
-        p = torch.randint(count, (count,), generator=generator).tolist()
-        b = torch.cat([crops[number] for number in p])
+        if crops:
+            p = torch.randint(count, (count,), generator=generator).tolist()
+            b = torch.cat([crops[number] for number in p])
         found.append(torch.stack([worst_tenth(arm[s][:, n][:, :, b]) for arm in arms]))
     return torch.stack(found)
 
@@ -135,9 +136,9 @@ def main() -> None:
     print("| factor | trained | as drawn | mean | worst tenth | wins |\n|---|---|---|---|---|---|")
     for factor in sorted(arms[reference].by_factor):
         scores = [arm.by_factor[factor] for arm in arms.values()]
-        drawn = resampled(scores, arms[reference].photograph)
+        alone, drawn = resampled(scores, None), resampled(scores, arms[reference].photograph)
         for number, (name, arm) in enumerate(arms.items()):
-            middle, (low, high) = float(worst_tenth(scores[number])), ends(drawn[:, number])
+            middle, (low, high) = float(worst_tenth(scores[number])), ends(alone[:, number])
             curves[name][factor] = (middle, low, high)
             wins = ""
             if number:
