@@ -25,6 +25,15 @@ AS_BUILT = [
     "as_built.tested=5",
 ]
 
+# What the parent's network has, and a U-Net has not; and windows of the textures' size.
+UNREAD = {
+    "phone_camera": (),
+    "large_fov_doublet": (
+        *("~network.stages", "~network.pyramid_channels"),
+        *("renderer.sensor.height=64", "renderer.sensor.width=64"),
+    ),
+}
+
 
 @pytest.fixture
 def camera(composed):
@@ -270,3 +279,25 @@ def test_a_batch_that_lenses_cannot_share_equally_is_refused(camera):
     made = module.manufacture.for_step(module.lens, design, 0)
     with pytest.raises(InputError, match="lenses_per_step"):
         images_of_made_lenses(module, module.manufacture, made, design, textures(3), None)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "glasses", "surfaces"),
+    [("phone_camera", 5, 10), ("large_fov_doublet", 2, 3)],
+)
+def test_other_cameras_are_made_with_errors_of_index_and_shape(
+    composed, experiment, glasses, surfaces
+):
+    cfg = composed(f"experiment={experiment}_as_built", "network=unet", *UNREAD[experiment])
+    module = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+    names = module.manufacture.tolerances.names
+    assert sum(name.startswith("media.") for name in names) == glasses
+    assert sum(".astigmatism_" in name for name in names) == 2 * surfaces
+    design, batch = module.variables(), textures(1, 64 + 64)
+    made = module.manufacture.for_step(module.lens, design, 0)
+    taken, _ = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
+    drawn, _ = module.take(design, batch, "train", 0)
+    difference = (taken.raw - drawn.raw).detach().abs().max()
+    assert 1e-4 < difference < 1.0
+    (slope,) = torch.autograd.grad(taken.raw.square().mean(), module.variables.scaled)
+    assert bool(slope.isfinite().all()) and slope.abs().max() > 0.0
