@@ -55,7 +55,7 @@ def eager_table(found: LaidOut, indices: Tensor) -> SurfaceTable:
 
 def eager_indices(found: LaidOut, wavelength: float | Tensor) -> Tensor:
     """Return what `record_indices` does; of a number a tensor that is kept, not to be changed."""
-    if not isinstance(wavelength, (int, float)):
+    if found.offsets or not isinstance(wavelength, (int, float)):
         return record_indices(found, wavelength, found.scalars[0].device)
     known = found.indices.get(wavelength)
     if known is None:

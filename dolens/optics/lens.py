@@ -11,6 +11,7 @@ from dolens.errors import InputError
 from dolens.optics.axial_ray import reversals
 from dolens.optics.backend import check_backend, is_few
 from dolens.optics.broken_axes import GlobalAxes
+from dolens.optics.departures import astigmatism_of, index_offsets, irregular
 from dolens.optics.elements import Element, ElementState
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
@@ -181,8 +182,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
 
         Args:
             values: parameter name → tensor used instead of the stored one; besides them
-                `surfaces.<n>.semi_diameter` of a circular aperture, mm, which no lens stores as a
-                parameter.
+                `surfaces.<n>.semi_diameter` of a circular aperture, mm, and what
+                `dolens.optics.departures` names, which no lens stores as parameters.
         """
         if not values:
             return self._kept_system.of(self, self._system)
@@ -201,7 +202,9 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             if surface.phase is not None:
                 own = _stored_or_given(surface.phase, values, f"surfaces.{number}.phase.")
                 law = LawState(type(surface.phase), own)
-            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge, law))
+            state = SurfaceState(type(surface), parameters, aperture, edge, law)
+            astigmatism = astigmatism_of(self, number, values) if values else None
+            surfaces.append(irregular(state, astigmatism) if astigmatism else state)
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
         ]
@@ -216,6 +219,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         ]
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
         image = image_surface(self, values)
+        offsets = index_offsets(self, values) if values else ()
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
         materials, mirrors = media_of(self.materials)
@@ -231,6 +235,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             self.reversals,
             image,
             self.fields is not None and self.fields.from_the_side,
+            offsets,
         )
         if not ideal_lenses(system):
             return system

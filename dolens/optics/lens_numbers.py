@@ -26,6 +26,7 @@ class LaidOut:
         arrays: further tensors, of any shape.
         media: of the rows of indices.
         indices: of some wavelengths, nm, as they were asked for; see `record_indices`.
+        offsets: added to the indices of the media; () where none is.
     """
 
     layout: Records
@@ -33,6 +34,7 @@ class LaidOut:
     arrays: tuple[Tensor, ...]
     media: tuple[Medium, ...]
     indices: dict[float, Tensor] = field(default_factory=dict)
+    offsets: tuple[Tensor | None, ...] = ()
 
 
 def lay_out(system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool) -> LaidOut:
@@ -135,8 +137,9 @@ def _look_up(system: OpticalSystem, sense: float, first: int, last: int, to_sens
         )
     )
     media = tuple(system.materials[k] for k in layout.media)
+    offsets = tuple(system.index_offsets[k] for k in layout.media) if system.index_offsets else ()
     return _Kept(
-        LaidOut(layout, tuple(scalars), tuple(arrays), media),
+        LaidOut(layout, tuple(scalars), tuple(arrays), media, offsets=offsets),
         [array.shape for array in arrays],
         tuple((kind, kind.kernel) for kind in kinds),
         all(is_by_names(kind.packed) for kind in kinds),

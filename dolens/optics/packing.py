@@ -221,6 +221,18 @@ def record_indices(found: LaidOut, wavelength: Wavelength, device: torch.device)
 
     Of a lens with deflections a last row holds λ/2π, mm.
     """
+    indices = _catalogue_indices(found, wavelength, device)
+    if not found.offsets:
+        return indices
+    zero = indices.new_zeros(())
+    added = [zero if offset is None else offset.to(indices) for offset in found.offsets]
+    # λ/2π is no index.
+    added += [zero] * (len(indices) - len(added))
+    return indices + torch.stack(added)[:, None]
+
+
+def _catalogue_indices(found: LaidOut, wavelength: Wavelength, device: torch.device) -> Tensor:
+    """Return the indices of the media as they are named."""
     used, waves = found.media, found.layout.waves
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)

@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from dolens.optics.departures import ASTIGMATISMS
 from dolens.optics.elements import DISPLACEMENTS, TILTS
 from dolens.optics.state_names import split_state
 
@@ -45,6 +46,7 @@ _UNIT_OF = {
         ("curvature", "curvature_x", "curvature_y", "sensor_curvature"), PER_MILLIMETRE
     ),
     "normalization_radius": MILLIMETRE,
+    **dict.fromkeys(ASTIGMATISMS, MILLIMETRE),
 }
 # Of names whose last part is a number or a coordinate.
 _UNIT_OF_GROUP = {"thicknesses": MILLIMETRE, "sources": MILLIMETRE}

@@ -32,6 +32,7 @@ class ParaxialNumbers:
         senses: +1 where light travels towards +z, -1 towards -z; of each medium.
         powers: what each surface adds to the power of refraction, a constant (1/mm) and a
             coefficient of the wavelength (1/(mm nm)); None where none adds any.
+        offsets: added to the index of each medium; () where nothing is.
     """
 
     curvatures: tuple[Number, ...]
@@ -42,13 +43,14 @@ class ParaxialNumbers:
     stop_radius: Number
     senses: tuple[float, ...]
     powers: tuple[tuple[Number, Number], ...] | None = None
+    offsets: tuple[Number, ...] = ()
 
     @classmethod
     @torch.no_grad()
     def of(cls, system: OpticalSystem) -> "ParaxialNumbers":
         """The numbers of a lens."""
-        curvatures, powers = curvatures_of(system), _powers(system)
-        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, *powers]
+        curvatures, powers, offsets = curvatures_of(system), _powers(system), _offsets(system)
+        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, *powers, *offsets]
         numbers = torch.stack(
             [torch.as_tensor(s, dtype=torch.float64, device=system.device) for s in scalars]
         ).tolist()
@@ -61,7 +63,8 @@ class ParaxialNumbers:
             system.stop,
             float(system.surfaces[system.stop - 1].semi_diameter),
             system.senses,
-            _pairs(numbers[2 * count :]),
+            _pairs(numbers[2 * count : 2 * count + len(powers)]),
+            tuple(numbers[2 * count + len(powers) :]),
         )
 
     @classmethod
@@ -69,9 +72,10 @@ class ParaxialNumbers:
         """The same numbers as tensors, in double precision on the CPU; None where no gradient
         would come of them.
         """
-        curvatures, powers = curvatures_of(system), _powers(system)
+        curvatures, powers, offsets = curvatures_of(system), _powers(system), _offsets(system)
         radius = system.surfaces[system.stop - 1].edge_radius
-        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, radius, *powers]
+        lengths = [*system.thicknesses, system.sensor_distance, radius]
+        scalars = [*curvatures, *lengths, *powers, *offsets]
         if not any(isinstance(s, Tensor) and s.requires_grad for s in scalars):
             return None
         numbers = [torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars]
@@ -84,7 +88,8 @@ class ParaxialNumbers:
             system.stop,
             numbers[2 * count],
             system.senses,
-            _pairs(numbers[2 * count + 1 :]),
+            _pairs(numbers[2 * count + 1 : 2 * count + 1 + len(powers)]),
+            tuple(numbers[2 * count + 1 + len(powers) :]),
         )
 
     @property
@@ -131,9 +136,17 @@ class ParaxialNumbers:
             powers,
         )
 
-    def _index(self, medium: int, wavelength: float) -> float:
+    def _index(self, medium: int, wavelength: float) -> Number:
         """Return a medium's index, negative where light travels towards -z."""
-        return self.senses[medium] * float(self.materials[medium].index(wavelength))
+        index: Number = float(self.materials[medium].index(wavelength))
+        if self.offsets:
+            index = index + self.offsets[medium]
+        return self.senses[medium] * index
+
+
+def _offsets(system: OpticalSystem) -> list[Number]:
+    """Return what is added to the index of each medium; nothing without any."""
+    return [0.0 if offset is None else offset for offset in system.index_offsets]
 
 
 def _powers(system: OpticalSystem) -> list[Number]:

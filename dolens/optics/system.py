@@ -46,6 +46,8 @@ class OpticalSystem:
             conics along their vertex plane and from behind it, and are traced by the reference.
         backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
             `auto`; see `dolens.optics.backend.choose_backend`.
+        index_offsets: added to the indices of these media, the same at all wavelengths; () where
+            none is.
     """
 
     surfaces: Sequence[SurfaceState]
@@ -59,6 +61,7 @@ class OpticalSystem:
     reversals: tuple[int, ...] = ()
     image: SurfaceState | None = None
     from_the_side: bool = False
+    index_offsets: tuple[Tensor | None, ...] = ()
 
     @cached_property
     def senses(self) -> tuple[float, ...]:
@@ -114,6 +117,9 @@ class OpticalSystem:
         # Each medium once: air comes between all the others.
         indices = {medium: medium.index(wavelength) for medium in dict.fromkeys(self.materials)}
         ordered = [indices[medium] for medium in self.materials]
+        for k, offset in enumerate(self.index_offsets):
+            if offset is not None:
+                ordered[k] = ordered[k] + offset.double()
         return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
 
     def signed_indices(self, wavelength: float | Tensor) -> list[float | Tensor]:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
+from dolens.optics.departures import departures
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
@@ -107,7 +108,7 @@ def assembled(
         errors: (P,), in the lens's units.
         target: what the line focuses by; None: the sensor stays at its nominal distance.
     """
-    stored = dict(lens.named_parameters())
+    stored = {**departures(lens), **dict(lens.named_parameters())}
     made = dict(values)
     for name, error in zip(tolerances.names, errors.unbind(), strict=True):
         nominal = values.get(name, stored[name])

@@ -2,8 +2,10 @@
 design.
 """
 
+import difflib
+import fnmatch
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
+from dolens.optics.departures import departures, names_departures
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import unit_of
 
@@ -95,9 +98,11 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
 
     Args:
         lens: whose parameters they are of, and whose present values are the design.
-        settings: name or pattern → half-range (degrees for tilts, mm, 1/mm), uniform; or → a
-            mapping of `half_range`, `distribution` (`uniform` or `normal`) and `relative` (the
-            half-range is a share of the value); None leaves a pattern out.
+        settings: name or pattern, of a parameter or of what `dolens.optics.departures` names
+            (`media.2.index_offset`, `surfaces.*.astigmatism_*`) → half-range (degrees for tilts,
+            mm, 1/mm), uniform; or → a mapping of `half_range`, `distribution` (`uniform` or
+            `normal`) and `relative` (the half-range is a share of the value); None leaves a pattern
+            out.
         factor: multiplies every half-range.
 
     Raises:
@@ -114,7 +119,7 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         if given is None:
             continue
         row = _row(pattern, given)
-        for name, parameter in lens.variables([pattern]).items():
+        for name, parameter in _named(lens, [pattern]).items():
             if name in rows:
                 raise InputError(f"tolerances.{pattern}: '{name}' has a tolerance already")
             if parameter.dim() > 0:
@@ -129,8 +134,9 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
             rows[name] = row
     if not rows:
         raise InputError("tolerances: none is given")
-    names = [name for name in lens.variables(list(rows)) if name in rows]
-    nominal = torch.stack([p.detach().double().cpu() for p in lens.variables(names).values()])
+    found = _named(lens, list(rows))
+    names = list(found)
+    nominal = torch.stack([value.detach().double().cpu() for value in found.values()])
     return Tolerances(
         tuple(names),
         nominal,
@@ -150,6 +156,26 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
 def scaled_tolerances(tolerances: Tolerances, factor: float) -> Tolerances:
     """Return the tolerances with every half-range multiplied by a factor."""
     return replace(tolerances, half_range=factor * tolerances.half_range)
+
+
+def _named(lens: Lens, patterns: Sequence[str]) -> dict[str, Tensor]:
+    """Return parameters and departures by name, in the order of the lens, departures last.
+
+    Raises:
+        InputError: a pattern matches nothing.
+    """
+    stored = [pattern for pattern in patterns if not names_departures(pattern)]
+    others = [pattern for pattern in patterns if names_departures(pattern)]
+    known = departures(lens)
+    for pattern in others:
+        if not fnmatch.filter(known, pattern):
+            near = difflib.get_close_matches(pattern, known, n=3, cutoff=0.4)
+            raise InputError(
+                f"tolerances.{pattern}: lens '{lens.name}' has no such number; "
+                f"allowed: {', '.join(near or known) or 'none'}"
+            )
+    parameters: dict[str, Tensor] = dict(lens.variables(stored)) if stored else {}
+    return parameters | departures(lens, others)
 
 
 def _row(pattern: str, given: object) -> tuple[float, bool, bool]:

@@ -13,7 +13,7 @@ class PhotographTable(lightning.Callback):
 
     Every judge has a table of its own besides, such as `test_wave_photographs.csv`.
     `dolens compare` pairs runs by these tables.  A camera that is judged as built has
-    `made_lenses.csv`, a row for each lens.
+    `made_lenses.csv`, a row for each lens, and `made_crops.csv`, one for each crop of each lens.
 
     Args:
         folder: the run folder.
@@ -29,3 +29,5 @@ class PhotographTable(lightning.Callback):
         made = getattr(pl_module, "made_scores", None)
         if made is not None:
             write_table(self.folder / "made_lenses.csv", made.rows(), digits=7)
+            rows = [row for found in (made, *pl_module.made_front) for row in found.crop_rows()]
+            write_table(self.folder / "made_crops.csv", rows, digits=7)

@@ -1,7 +1,8 @@
 """Cameras as built: each lens is off by its tolerances, and focused by an assembly line."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from dolens.tolerancing import (
     Tolerances,
     assembled,
     expected_spread,
+    scaled_tolerances,
     tolerances_from,
 )
 
@@ -48,6 +50,8 @@ class AsBuilt:
             pixels², beside the loss; 0: none.
         tested: lenses that the camera is judged by, behind its test; 0: none.
         crops: test crops that each of them images.
+        judged_factors: factors besides, at which the same camera is judged by as many lenses; the
+            errors of the lens of one number are in proportion.
         loss_db: a lens passes whose worst view loses no more than this to the lens as drawn.
 
     Raises:
@@ -64,6 +68,7 @@ class AsBuilt:
     desensitising: float = 0.0
     tested: int = 500
     crops: int = 4
+    judged_factors: Sequence[float] = ()
     loss_db: float = 1.0
 
     def __post_init__(self) -> None:
@@ -75,6 +80,8 @@ class AsBuilt:
         for name in ("tested", "read_noise", "desensitising"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"as_built.{name}: {getattr(self, name)}; allowed: 0 or more")
+        for factor in self.judged_factors:
+            check_positive("as_built.judged_factors", factor)
 
 
 class MadeLens(NamedTuple):
@@ -127,6 +134,13 @@ class Manufacture:
             FocusTarget.of(lens, views.object_distance, waves) if settings.focused else None
         )
         self._spots = views.spots(lens, 3, 6) if settings.desensitising else []
+
+    def at_factor(self, factor: float) -> "Manufacture":
+        """Return the manufacture of the same lenses to tolerances times another factor."""
+        found = copy.copy(self)
+        found.tolerances = scaled_tolerances(self.tolerances, factor / self.settings.factor)
+        found.settings = replace(self.settings, factor=factor)
+        return found
 
     @property
     def in_training(self) -> bool:

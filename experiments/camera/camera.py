@@ -28,6 +28,7 @@ from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.made_images import restored_in_parts, training_images
 from dolens.experiments.camera.made_lens_scores import (
     MadeLensScores,
+    front_numbers,
     made_lens_scores,
     made_lenses_figure_of,
 )
@@ -153,6 +154,7 @@ class CameraModule(Camera):
                 "(optimizer.lens=dls): 0, as they do not know of it"
             )
         self.made_scores: MadeLensScores | None = None
+        self.made_front: list[MadeLensScores] = []
         self._made_crops: list[Tensor] = []
 
     def check_trainer(self, trainer: lightning.Trainer) -> None:
@@ -338,6 +340,10 @@ class CameraModule(Camera):
             of = photographs_of_crops(self.trainer, "test", len(crops))
             with named_stage("lenses as built"):
                 self.made_scores = made_lens_scores(self, self.manufacture, crops, of)
+                self.made_front = [
+                    made_lens_scores(self, self.manufacture.at_factor(factor), crops, of)
+                    for factor in self.manufacture.settings.judged_factors
+                ]
 
         if "test" in self.test_scores:
             logger.info("%s", gain_line(self.test_scores["test"]))
@@ -363,7 +369,7 @@ class CameraModule(Camera):
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers() | self.evaluation.costs()
         if self.made_scores is not None:
-            numbers |= self.made_scores.numbers()
+            numbers |= self.made_scores.numbers() | front_numbers(self.made_front)
         return numbers | self.lens_steps.numbers() | self.costs.numbers()
 
     def metric_names(self) -> list[str]:

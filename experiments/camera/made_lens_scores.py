@@ -24,26 +24,35 @@ _SEED, _RESAMPLES, _LEVEL = 0, 2000, 0.95
 
 @dataclass(frozen=True)
 class MadeLensScores:
-    """Scores of N lenses that were made, on the same crops with the same noise.
+    """Scores of N lenses that were made, on the same B crops with the same noise.
 
     Attributes:
         views: labels of the V views.
-        psnr_db: (N, V), means over crops.
-        as_drawn: (V,), of the lens without errors.
+        by_crop: PSNR (N, B, V), dB.
+        photographs: the photograph of each crop.
+        as_drawn: (V,), of the lens without errors, mean over crops.
         errors: (N, P), of the parameters, in the lens's units.
         tolerances: of these parameters.
         loss_db: a lens passes that loses no more than this to the lens as drawn, each by its worst
             view.
         seconds: that one lens takes.
+        factor: of the tolerances.
     """
 
     views: tuple[str, ...]
-    psnr_db: Tensor
+    by_crop: Tensor
+    photographs: tuple[str, ...]
     as_drawn: Tensor
     errors: Tensor
     tolerances: Tolerances
     loss_db: float
     seconds: float
+    factor: float = 1.0
+
+    @property
+    def psnr_db(self) -> Tensor:
+        """Return the means over crops, (N, V), dB."""
+        return self.by_crop.mean(1)
 
     @property
     def worst_view(self) -> Tensor:
@@ -95,6 +104,31 @@ class MadeLensScores:
             for number, (scores, off) in enumerate(zip(self.psnr_db, shares, strict=True))
         ]
 
+    def crop_rows(self) -> list[Row]:
+        """Return a row for each lens and crop: its PSNR by view."""
+        return [
+            {
+                "factor": f"{self.factor:g}",
+                "lens": str(number),
+                "photograph": photograph,
+                **{f"psnr_db/{v}": float(s) for v, s in zip(self.views, scores, strict=True)},
+            }
+            for number, crops in enumerate(self.by_crop)
+            for photograph, scores in zip(self.photographs, crops, strict=True)
+        ]
+
+
+def front_numbers(others: Sequence[MadeLensScores]) -> dict[str, float]:
+    """Return `made/factor_<f>/...` and `error/made/factor_<f>/...` of the same camera's lenses at
+    other factors of the tolerances.
+    """
+    return {
+        name.replace("made/", f"made/factor_{found.factor:g}/"): value
+        for found in others
+        for name, value in found.numbers().items()
+        if "made/" in name
+    }
+
 
 def spread_over_photographs(photographs: Sequence[str], count: int) -> list[int]:
     """Return the numbers of so many crops, of as many photographs as there are.
@@ -132,7 +166,8 @@ def made_lens_scores(
         crops: textures (B, 3, h, w), linear light, of which some are taken.
         photographs: the photograph of each.
     """
-    crops = crops[spread_over_photographs(photographs, manufacture.settings.crops)]
+    chosen = spread_over_photographs(photographs, manufacture.settings.crops)
+    crops = crops[chosen]
     judging = camera.views.judged_by_training()
     design = camera.variables()
     started = time.perf_counter()
@@ -143,7 +178,7 @@ def made_lens_scores(
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)
         truth = taken.truth.to(restored.dtype)
         found = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1))
-        return found.unflatten(0, truth.shape[:2]).mean(0).double().cpu()
+        return found.unflatten(0, truth.shape[:2]).double().cpu()
 
     with evaluating(camera.network):
         of_design = camera.functions(design)
@@ -161,11 +196,13 @@ def made_lens_scores(
     return MadeLensScores(
         tuple(judging.labels()),
         torch.stack(rows),
-        as_drawn,
+        tuple(photographs[number] for number in chosen),
+        as_drawn.mean(0),
         torch.stack(errors),
         manufacture.tolerances,
         manufacture.settings.loss_db,
         seconds,
+        manufacture.settings.factor,
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count, numbers_of
 from dolens.experiments.experiment import Figures
@@ -23,6 +24,7 @@ from dolens.experiments.tolerances.tables import (
     sensitivity_rows,
 )
 from dolens.experiments.workers import workers_of
+from dolens.optics.departures import names_departures
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
@@ -119,6 +121,11 @@ class TolerancesModule(Analysis):
         self.spots = spots
         self.weights = self._weights(weights)
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
+        for name in filter(names_departures, self.tolerances.names):
+            raise InputError(
+                f"tolerances.{name}: allowed here: parameters of the lens, which rays have "
+                "derivatives by; a camera's made lenses may have this error"
+            )
         self.monte_carlo = monte_carlo
         self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
         # Chunks of this process have threads of their own, which changes no bit.

@@ -25,6 +25,15 @@ AS_BUILT = [
     "as_built.tested=5",
 ]
 
+# What the parent's network has, and a U-Net has not; and windows of the textures' size.
+UNREAD = {
+    "phone_camera": (),
+    "large_fov_doublet": (
+        *("~network.stages", "~network.pyramid_channels"),
+        *("renderer.sensor.height=64", "renderer.sensor.width=64"),
+    ),
+}
+
 
 @pytest.fixture
 def camera(composed):
@@ -40,7 +49,7 @@ def textures(count=2, side=24 + 32):
 
 
 def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
-    run(composed(*AS_BUILT))
+    run(composed(*AS_BUILT, "as_built.judged_factors=[3]"))
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     with (tmp_path / "run/made_lenses.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -57,6 +66,19 @@ def test_a_run_is_judged_by_the_lenses_of_its_table(composed, tmp_path):
     assert max(abs(float(row["surfaces.2.curvature (%)"])) for row in rows) <= 1.0
     assert (tmp_path / "run/figures/made_lenses.png").stat().st_size > 5000
     assert metrics["train/loss"] > 0.0
+    with (tmp_path / "run/made_crops.csv").open() as file:
+        crops = list(csv.DictReader(file))
+    views = [name for name in crops[0] if name.startswith("psnr_db/")]
+    for factor, column in (("1", "made"), ("3", "made/factor_3")):
+        of = [r for r in crops if r["factor"] == factor]
+        means = []
+        for lens in map(str, range(5)):
+            table = [[float(r[view]) for view in views] for r in of if r["lens"] == lens]
+            means.append(min(sum(c) / len(c) for c in zip(*table, strict=True)))
+        assert metrics[f"{column}/psnr_db/worst_decile"] == pytest.approx(min(means), rel=1e-6)
+    # The same camera, whatever it is judged by.
+    drawn = "psnr_db/as_drawn"
+    assert metrics[f"made/{drawn}"] == metrics[f"made/factor_3/{drawn}"]
 
 
 def test_crops_are_of_as_many_photographs_as_there_are():
@@ -77,6 +99,14 @@ def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
     torch.testing.assert_close(taken.truth, drawn.truth, rtol=0.0, atol=1e-4)
     for part in own:
         torch.testing.assert_close(part, functions, rtol=0.0, atol=1e-6)
+
+
+def test_errors_at_another_factor_are_in_proportion(camera):
+    module = camera("as_built.factor=2")
+    design = module.variables()
+    wide = module.manufacture.at_factor(6.0)
+    one, other = (m.tested(module.lens, design, 3).errors for m in (module.manufacture, wide))
+    torch.testing.assert_close(other, 3.0 * one)
 
 
 def test_each_lens_has_its_part_of_the_batch(camera):
@@ -108,6 +138,8 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
         "elements.plate.decenter_[xy]": 0.2,
         "surfaces.[123].curvature": {"half_range": 0.01, "relative": True},
         "thicknesses.[1234]": 0.1,
+        "media.[124].index_offset": 5e-4,
+        "surfaces.*.astigmatism_*": 2e-4,
     }
     settings = AsBuilt(calibration="own")
     batch = textures(1).double()
@@ -193,7 +225,8 @@ def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
     worst = torch.arange(1.0, 31.0, dtype=torch.float64)
     scores = MadeLensScores(
         ("a", "b"),
-        torch.stack([worst, worst + 5.0], 1),
+        torch.stack([worst, worst + 5.0], 1)[:, None].expand(-1, 3, -1),
+        ("cat", "cat", "dog"),
         torch.tensor([20.0, 30.0]),
         torch.zeros(30, len(module.manufacture.tolerances.names)),
         module.manufacture.tolerances,
@@ -213,6 +246,7 @@ def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
         ("as_built.lenses_per_step=0", "as_built.lenses_per_step"),
         ("as_built.electrons=-1", "as_built.electrons"),
         ("as_built.tested=-1", "as_built.tested"),
+        ("as_built.judged_factors=[0]", "as_built.judged_factors"),
         ("+tolerances={surfaces.9.curvature: 0.1}", "surfaces.9.curvature"),
     ],
 )
@@ -245,3 +279,25 @@ def test_a_batch_that_lenses_cannot_share_equally_is_refused(camera):
     made = module.manufacture.for_step(module.lens, design, 0)
     with pytest.raises(InputError, match="lenses_per_step"):
         images_of_made_lenses(module, module.manufacture, made, design, textures(3), None)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "glasses", "surfaces"),
+    [("phone_camera", 5, 10), ("large_fov_doublet", 2, 3)],
+)
+def test_other_cameras_are_made_with_errors_of_index_and_shape(
+    composed, experiment, glasses, surfaces
+):
+    cfg = composed(f"experiment={experiment}_as_built", "network=unet", *UNREAD[experiment])
+    module = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+    names = module.manufacture.tolerances.names
+    assert sum(name.startswith("media.") for name in names) == glasses
+    assert sum(".astigmatism_" in name for name in names) == 2 * surfaces
+    design, batch = module.variables(), textures(1, 64 + 64)
+    made = module.manufacture.for_step(module.lens, design, 0)
+    taken, _ = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
+    drawn, _ = module.take(design, batch, "train", 0)
+    difference = (taken.raw - drawn.raw).detach().abs().max()
+    assert 1e-4 < difference < 1.0
+    (slope,) = torch.autograd.grad(taken.raw.square().mean(), module.variables.scaled)
+    assert bool(slope.isfinite().all()) and slope.abs().max() > 0.0

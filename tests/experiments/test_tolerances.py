@@ -123,6 +123,10 @@ BAD_INPUT = {
         ["+tolerances={elements.back.tilt_x: 0.1}"],
         "no parameter 'elements.back.tilt_x'",
     ),
+    "an error that rays have no derivative by": (
+        ["+tolerances={media.1.index_offset: 0.0005}"],
+        "tolerances.media.1.index_offset: allowed here: parameters of the lens",
+    ),
     "negative half-range": (["+tolerances={thicknesses.2: -1}"], "tolerances.thicknesses.2"),
     "no lenses": (["lenses=0"], "lenses: 0; allowed: an integer of 1 or more"),
     "half a field": (["fields=[[0]]"], "fields: 2 numbers are needed, not 1"),

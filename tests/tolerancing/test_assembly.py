@@ -136,3 +136,25 @@ def test_a_line_without_light_cannot_focus(triplet, target):
     shut = {"surfaces.4.semi_diameter": torch.tensor(1e-6, dtype=torch.float64)}
     with pytest.raises(InputError, match="no light"):
         best_focus(triplet.system(shut), target)
+
+
+def test_a_lens_of_another_index_is_focused_where_its_glass_has_the_focus(triplet, target):
+    tolerances = tolerances_from(
+        triplet, {"media.*.index_offset": 1e-3, "surfaces.*.astigmatism_0": 5e-4}
+    )
+    (errors,) = tolerances.draw(1, torch.Generator().manual_seed(4))
+    made = assembled(triplet, {}, tolerances, errors, target)
+    assert set(made) == {*tolerances.names, "sensor_distance"}
+    of_made = best_focus(triplet.system(made), target)
+    torch.testing.assert_close(of_made, best_focus(triplet.system(), target), rtol=0.0, atol=1e-9)
+
+    def sensor(at):
+        return assembled(triplet, {}, tolerances, at, target)["sensor_distance"]
+
+    start = errors.clone().requires_grad_()
+    (found,) = torch.autograd.grad(sensor(start), start)
+    for column in range(len(errors)):
+        step = torch.zeros_like(errors)
+        step[column] = 1e-6
+        difference = float((sensor(errors + step) - sensor(errors - step)).detach()) / 2e-6
+        assert float(found[column]) == pytest.approx(difference, rel=1e-5, abs=1e-5)

@@ -124,3 +124,29 @@ def test_arrays_are_refused(root):
 def test_a_factor_must_be_positive(triplet, factor):
     with pytest.raises(InputError, match="tolerance_factor: must be a positive number"):
         tolerances_from(triplet, {"thicknesses.1": 0.1}, factor)
+
+
+def test_indices_and_irregular_surfaces_have_tolerances(triplet):
+    found = tolerances_from(
+        triplet,
+        {
+            "media.*.index_offset": 5e-4,
+            "surfaces.[12].astigmatism_*": 1.4e-4,
+            "thicknesses.1": 0.02,
+        },
+        factor=2.0,
+    )
+    assert found.names == (
+        "thicknesses.1",
+        *("surfaces.1.astigmatism_0", "surfaces.1.astigmatism_45"),
+        *("surfaces.2.astigmatism_0", "surfaces.2.astigmatism_45"),
+        *(f"media.{n}.index_offset" for n in (1, 3, 5)),
+    )
+    assert found.nominal.tolist() == pytest.approx([3.259, *[0.0] * 7])
+    assert found.steps.tolist() == pytest.approx([0.04, *[2.8e-4] * 4, *[1e-3] * 3])
+    assert [found.label(column) for column in (1, 5)] == ["± 0.00028 mm", "± 0.001"]
+    # The air between the elements is no glass.
+    with pytest.raises(InputError, match=r"^tolerances\.media\.2\.index_offset: .*media\.1"):
+        tolerances_from(triplet, {"media.2.index_offset": 5e-4})
+    with pytest.raises(InputError, match="is zero, and so is any share of it"):
+        tolerances_from(triplet, {"media.1.index_offset": {"half_range": 0.1, "relative": True}})

@@ -21,6 +21,7 @@ def depends_on_parameters(system: OpticalSystem) -> bool:
     if not torch.is_grad_enabled():
         return False
     tensors = [system.sensor_distance, *system.thicknesses]
+    tensors += [offset for offset in system.index_offsets if offset is not None]
     for surface in system.surfaces:
         tensors += surface.parameters.values()
         if surface.edge is not None:
