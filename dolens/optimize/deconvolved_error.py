@@ -20,7 +20,11 @@ from dolens.optimize.loss_residuals import RayGroups
 # Rows: luminance, red against blue, green against both (see `opponent_wiener`).
 _OPPONENT = ((1.0, 1.0, 1.0), (1.0, 0.0, -1.0), (1.0, -2.0, 1.0))
 # Their power in photographs, over that of luminance.
-_OPPONENT_POWER = (1.0, 1.0 / 7.0, 1.0 / 20.0)
+_OPPONENT_POWER = (1.0, 0.07, 0.018)
+# Luminance's f²·S at f₁, f₁, how it falls from there, and where textures end, cycles a pixel.
+_POWER, _FREQUENCY, _FALL, _END = 0.002, 0.05, 0.4, 0.38
+# The lowest frequency: blur takes nothing from larger shapes.
+_LOWEST = 1.0 / 128.0
 # Smaller than any error, so that the power mean's root is never taken of zero.
 _TINY = 1e-12
 
@@ -32,9 +36,6 @@ class Photographs:
     Attributes:
         pitch: of the pixels, mm.
         noise: N, variance of a pixel of mean grey.
-        variance: of the photographs, mean over the colours.
-        outer_scale: pixels; the spectrum is S ∝ 1/(f² + 1/outer_scale²), f in cycles a pixel
-            (Field, J. Opt. Soc. Am. A 4, 2379, 1987).
 
     Raises:
         InputError: a number that is not positive.
@@ -42,13 +43,26 @@ class Photographs:
 
     pitch: float
     noise: float
-    variance: float = 0.04
-    outer_scale: float = 64.0
 
     def __post_init__(self) -> None:
-        for name in ("pitch", "noise", "variance", "outer_scale"):
+        for name in ("pitch", "noise"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name}: {getattr(self, name)}; allowed: above 0")
+
+
+def luminance_spectrum(frequency: Tensor) -> Tensor:
+    """Return the power spectrum S of photographs' luminance, linear light, 1 for white.
+
+    S = 0.002·(f/0.05)^-0.4·exp(-(f/0.38)²)/f².  Fitted to 240 crops of 128×128 pixels of 31
+    photographs that cameras are trained on; within 20 % of them from 0.017 to 0.45 cycles a pixel.
+    It falls faster than Field's 1/f² (J. Opt. Soc. Am. A 4, 2379, 1987), as pixels of photographs
+    are soft themselves.
+
+    Args:
+        frequency: f, cycles a pixel, above 0.
+    """
+    falling = (frequency / _FREQUENCY) ** -_FALL * torch.exp(-((frequency / _END) ** 2))
+    return _POWER * falling / frequency.square()
 
 
 @dataclass(frozen=True)
@@ -208,7 +222,7 @@ class DeconvolvedError:
         """Return E (V,) of transfer functions (F, V, 3), complex."""
         like = transfer.real.detach()
         frequency, area = self._frequencies(like)
-        power = self._spectrum(frequency, area)
+        power = luminance_spectrum(frequency.norm(dim=-1))
         covariance = _covariance().to(like)
         count = int(self.filters.max()) + 1
         member = torch.nn.functional.one_hot(self.filters, count).to(like)  # (V, G)
@@ -248,7 +262,7 @@ class DeconvolvedError:
 
         Radii are even in their logarithm, as the power is.
         """
-        lowest, highest = math.log(0.5 / self.photographs.outer_scale), math.log(0.5)
+        lowest, highest = math.log(_LOWEST), math.log(0.5)
         step = (highest - lowest) / self.rings
         radius = (lowest + step * (torch.arange(self.rings).to(like) + 0.5)).exp()
         angle = math.pi / self.arms * (torch.arange(self.arms).to(like) + 0.5)
@@ -256,14 +270,9 @@ class DeconvolvedError:
         area = (radius.square() * step * math.pi / self.arms)[:, None].expand(-1, self.arms)
         return frequency.flatten(0, 1), area.flatten()
 
-    def _spectrum(self, frequency: Tensor, area: Tensor) -> Tensor:
-        """Return S (F,), so that the mean variance of the colours is that of the photographs."""
-        shape = 1.0 / (frequency.square().sum(-1) + self.photographs.outer_scale**-2)
-        return shape * (self.photographs.variance / (2.0 * (area * shape).sum()))
-
 
 def _covariance() -> Tensor:
-    """Return C (3, 3) of red, green and blue, with trace 3."""
+    """Return C (3, 3) of red, green and blue, over the power of luminance."""
     axes = torch.nn.functional.normalize(torch.tensor(_OPPONENT, dtype=torch.float64), dim=1)
     power = torch.tensor(_OPPONENT_POWER, dtype=torch.float64)
-    return axes.T @ ((3.0 / power.sum()) * power[:, None] * axes)
+    return axes.T @ (power[:, None] * axes)

@@ -71,7 +71,6 @@ def _all_shapes(
             f"scene.depths={depths}",
             *waves,
             "renderer.sensor.pixel_pitch=0.01",
-            "light=300.0",
             "readout.reference_f_number=null",
             f"++variables={{sensor_distance: {{scale: 0.01, initial: {focus}, lower: null, "
             f"upper: null}}, {_SHAPES}}}",
