@@ -28,15 +28,19 @@ from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.made_images import restored_in_parts, training_images
 from dolens.experiments.camera.made_lens_scores import (
     MadeLensScores,
-    front_numbers,
     made_lens_scores,
     made_lenses_figure_of,
 )
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
-from dolens.experiments.camera.restoration_gain import gain_line, gain_numbers
+from dolens.experiments.camera.restoration_gain import gain_line
 from dolens.experiments.camera.settings import Reconstruction, Training
+from dolens.experiments.camera.training_parts import (
+    check_sharing,
+    parameter_groups,
+    summary_numbers,
+)
 from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
@@ -163,17 +167,7 @@ class CameraModule(Camera):
         Raises:
             InputError: the line names the setting.
         """
-        batches = trainer.accumulate_grad_batches
-        if batches > 1 and self.adversary is not None:
-            raise InputError(
-                f"trainer.accumulate_grad_batches: {batches}; allowed with a discriminator: 1, as "
-                "it makes a step for every batch"
-            )
-        if self.manufacture is not None and trainer.world_size > 1:
-            raise InputError(
-                f"trainer.devices: {trainer.world_size}; allowed with tolerances: 1, as one "
-                "process makes the lenses of a step"
-            )
+        check_sharing(trainer, self.adversary, self.manufacture)
 
     # ---------------------------------------------------------------- training
 
@@ -188,22 +182,7 @@ class CameraModule(Camera):
 
     def configure_optimizers(self) -> Any:
         """Return one optimizer, with a group for the network and one for the lens's variables."""
-        groups = [
-            {
-                "params": list(self.network.parameters()),
-                "lr": self.learning_rates.network,
-                "name": "network",
-            }
-        ]
-        if len(self.variables) and not self.lens_steps.apart:
-            groups.append(
-                {
-                    "params": [self.variables.scaled],
-                    "lr": self.learning_rates.optics,
-                    "name": "optics",
-                }
-            )
-        optimizer = self.optimizer(groups)
+        optimizer = self.optimizer(parameter_groups(self))
         if self.scheduler is None:
             return optimizer
         return {
@@ -360,17 +339,7 @@ class CameraModule(Camera):
 
     def summary(self) -> dict[str, float]:
         """Return the variables, intervals of scores, and costs."""
-        numbers = {n: float(v) for n, v in variable_numbers(self.variables()).items()}
-        for stage, scores in self.test_scores.items():
-            numbers |= scores.numbers(stage) | gain_numbers(scores, stage)
-        numbers["network/pretrained"] = float(self.network.pretrained)
-        if hasattr(self.loss, "perceptual_available"):  # a loss of a user's own may know no such
-            numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
-        numbers["cost/rays"] = float(self.views.rays())
-        numbers |= self.views.numbers() | self.evaluation.costs()
-        if self.made_scores is not None:
-            numbers |= self.made_scores.numbers() | front_numbers(self.made_front)
-        return numbers | self.lens_steps.numbers() | self.costs.numbers()
+        return summary_numbers(self)
 
     def metric_names(self) -> list[str]:
         """Return the names of scores, and what others begin with."""
