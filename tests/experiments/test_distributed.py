@@ -108,7 +108,9 @@ def test_two_processes_train_and_test_as_one(composed, tmp_path, two):
     assert first.keys() == second.keys()
     for name, value in first.items():
         if name.startswith(("train/", "val/", "test/", "error/", "variables/")):
-            assert second[name] == pytest.approx(value, rel=1e-4, abs=1e-6), name
+            # A gain is the difference of two PSNRs of some 20 dB, each known to rel=1e-4.
+            absolute = 1e-3 if "/gain_over_" in name else 1e-6
+            assert second[name] == pytest.approx(value, rel=1e-4, abs=absolute), name
     # Every photograph once, of batches that the processes took in turns.
     tables = [rows_of(folder / "test_photographs.csv") for folder in (one, two)]
     for row, other in zip(*tables, strict=True):
