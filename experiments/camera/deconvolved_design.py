@@ -56,6 +56,7 @@ def design_for_deconvolution(
     views: Imaging,
     operands: CameraOperands,
     iterations: int,
+    damping: float,
     strength: float,
     view_norm: float,
 ) -> DeconvolvedDesign:
@@ -67,6 +68,7 @@ def design_for_deconvolution(
         views: image the scene.
         operands: what the lens must be besides.
         iterations: at most.
+        damping: initial, see `DampedLeastSquares`.
         strength: share of the best linear filter that the network is thought to find; see
             `DeconvolvedError`.
         view_norm: p of the power mean of the views' errors.
@@ -77,7 +79,11 @@ def design_for_deconvolution(
     first, reached, made = math.nan, math.inf, 0
     for _ in range(_ROUNDS):
         merit = merit_of(lens, variables, views, operands, strength, view_norm)
-        steps = DampedLeastSquares([variables.parameter_group()], merit_tolerance=_TOLERANCE)
+        steps = DampedLeastSquares(
+            [variables.parameter_group()],
+            initial_damping=damping,
+            merit_tolerance=_TOLERANCE,
+        )
         begun = merit().sum_of_squares()
         if not math.isfinite(begun):
             raise InputError(

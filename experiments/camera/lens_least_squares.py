@@ -76,6 +76,7 @@ class LensLeastSquares:
         max_trust_radius: how far they may move in any later one.
         first_iterations: of damped least squares for the deconvolved error, before the network
             begins to train; see `dolens.optimize.deconvolved_error`.  0: none.
+        first_damping: their initial damping: the larger, the nearer is the minimum that is found.
         strength: share of the best linear filter that the network is thought to find; None: 1 of
             a network that is given point spread functions, 0 of another.
 
@@ -94,12 +95,18 @@ class LensLeastSquares:
         trust_radius: float = 0.1,
         max_trust_radius: float = 0.5,
         first_iterations: int = 0,
+        first_damping: float = 1e-3,
         strength: float | None = None,
         damping: float = 1e-3,
         rings: int = 4,
         arms: int = 8,
     ) -> None:
-        for name, value in (("every", every), ("trust_radius", trust_radius), ("damping", damping)):
+        for name, value in (
+            ("every", every),
+            ("trust_radius", trust_radius),
+            ("first_damping", first_damping),
+            ("damping", damping),
+        ):
             if not 0.0 < value < math.inf:
                 raise InputError(f"optimizer.least_squares.{name}: {value}; allowed: above 0")
         if not max_trust_radius >= trust_radius:
@@ -116,6 +123,7 @@ class LensLeastSquares:
                 f"optimizer.least_squares.strength: {strength}; allowed: null, or 0 to 1"
             )
         self.first_iterations, self.strength = int(first_iterations), strength
+        self.first_damping = float(first_damping)
         self.every, self.damping = int(every), float(damping)
         self.rings, self.arms = int(rings), int(arms)
         self.trust_radius, self.max_trust_radius = float(trust_radius), float(max_trust_radius)

@@ -79,6 +79,7 @@ class LensSteps:
             self._views,
             self.operands,
             least_squares.first_iterations,
+            least_squares.first_damping,
             float(knows_blur) if strength is None else strength,
             view_norm,
         )

@@ -165,3 +165,25 @@ def test_a_first_design_out_of_range_is_an_error(settings, message):
 def test_a_share_out_of_range_is_an_error():
     with pytest.raises(InputError, match=r"optimizer\.until: 1\.5; allowed: 0 to 1"):
         CameraOptimizer(torch.optim.Adam, until=1.5)
+
+
+def test_the_plate_that_a_network_learned_has_the_least_deconvolved_error(composed, tmp_path):
+    """Coefficients that `experiment=wavefront_coding` learned by Adam with its network, seed 0."""
+    run(
+        composed(
+            "experiment=wavefront_coding",
+            *TINY,
+            *TINY_NETWORK,
+            "optimizer.lens=dls",
+            "optimizer.least_squares.first_iterations=20",
+            "optimizer.least_squares.first_damping=0.3",
+            "optimizer.until=0.0",
+            "data.steps_per_epoch=1",
+            "trainer.max_epochs=1",
+        )
+    )
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["variables/sensor_distance"] == pytest.approx(95.80, abs=0.02)
+    learned = {"x3": 8.79e-6, "x2y": 5.43e-6, "xy2": 3.94e-6, "y3": 8.35e-6}
+    for name, value in learned.items():
+        assert metrics[f"variables/surfaces.5.{name}"] == pytest.approx(value, abs=2e-6)
