@@ -28,6 +28,12 @@ REFUSED = {
     ("freeform_corrector", ".zmx"): "surface 2: a .zmx file cannot hold type 'b_spline'",
     ("freeform_corrector", ".txt"): "surface 2: a .txt file cannot hold type 'b_spline'",
     ("freeform_corrector", ".seq"): "surface 2: a .seq file cannot hold type 'b_spline'",
+    # Plastics are no glass of a maker that these formats know.
+    **{
+        (name, suffix): f"surface 2: a {suffix} file cannot hold material 'PLASTIC:ZEONEX-E48R'"
+        for name in ("phone", "phone_insensitive")
+        for suffix in (".txt", ".seq")
+    },
 }
 FORMATS = {
     ".txt": lambda data: prescription_from_diffoptics(diffoptics_text_of(data)),
@@ -38,6 +44,11 @@ FORMATS = {
 }
 
 
+def indices(material):
+    """Refractive indices at three lines, of models and of glasses of a catalogue."""
+    return [float(material.index(wavelength)) for wavelength in (486.1327, 587.5618, 656.2725)]
+
+
 def require_equal(found, wanted):
     before, after = dict(wanted.named_parameters()), dict(found.named_parameters())
     assert before.keys() == after.keys()
@@ -46,7 +57,7 @@ def require_equal(found, wanted):
     for n, surface in wanted.surfaces.items():
         assert type(found.surfaces[n]) is type(surface)
         assert found.surfaces[n].semi_diameter == surface.semi_diameter
-    assert [(m.a, m.b) for m in found.materials] == [(m.a, m.b) for m in wanted.materials]
+    assert [indices(m) for m in found.materials] == [indices(m) for m in wanted.materials]
     for key in ("name", "stop", "index_model", "sensor_diameter", "object_distance"):
         assert getattr(found, key) == getattr(wanted, key)
     for key in ("wavelengths", "reference_wavelength", "fields"):
