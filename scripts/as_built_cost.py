@@ -18,19 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import open_dict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.made_images import restored_in_parts, training_images
-from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
+from scripts.composed import composed
 
-ROOT = Path(__file__).resolve().parents[1]
 ARMS = (0, 1, 2, 4)
 
 
@@ -42,12 +38,9 @@ def step_of(overrides: list[str], lenses: int) -> Callable[[], None]:
         lenses: of a step; 0: the lens as drawn.
     """
     arm = ["as_built.train=false"] if lenses == 0 else [f"as_built.lenses_per_step={lenses}"]
-    cfg = compose("train", [*overrides, *arm], return_hydra_config=True)
-    with open_dict(cfg):
-        cfg.hydra.runtime.output_dir, cfg.hydra.job.num = str(ROOT / "outputs"), 0
-    HydraConfig.instance().set_config(cfg)
-    camera: Any = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
-    data: Any = instantiate(cfg.data)
+    with composed([*overrides, *arm]) as cfg:
+        camera: Any = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+        data: Any = instantiate(cfg.data)
     data.setup("fit")
     batch = next(iter(data.train_dataloader()))
 
@@ -68,22 +61,20 @@ def main() -> None:
     parser.add_argument("--arm", type=int)
     given = parser.parse_intermixed_args()
     torch.set_num_threads(1)
-    register_resolvers()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        if given.arm is not None:
-            step = step_of(given.overrides, given.arm)
-            for _ in range(5):
-                step()
-            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
-            return
-        steps = {lenses: step_of(given.overrides, lenses) for lenses in ARMS}
-        seconds: dict[int, list[float]] = {lenses: [] for lenses in ARMS}
-        for number in range(given.rounds + 1):
-            for lenses, step in steps.items():
-                start = time.process_time()
-                step()
-                if number:  # the first compiles
-                    seconds[lenses].append(time.process_time() - start)
+    if given.arm is not None:
+        step = step_of(given.overrides, given.arm)
+        for _ in range(5):
+            step()
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+        return
+    steps = {lenses: step_of(given.overrides, lenses) for lenses in ARMS}
+    seconds: dict[int, list[float]] = {lenses: [] for lenses in ARMS}
+    for number in range(given.rounds + 1):
+        for lenses, step in steps.items():
+            start = time.process_time()
+            step()
+            if number:  # the first compiles
+                seconds[lenses].append(time.process_time() - start)
     for lenses in ARMS:
         arm = [sys.executable, __file__, *given.overrides, "--arm", str(lenses)]
         memory = float(subprocess.run(arm, capture_output=True, text=True, check=True).stdout)

@@ -26,6 +26,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from dolens.experiments.camera.made_lens_scores import worst_decile
 from dolens.plotting import save_figure
 from dolens.plotting.made_front import made_front_figure
 
@@ -76,8 +77,7 @@ def worst_view(scores: Tensor) -> Tensor:
 
 def worst_tenth(scores: Tensor) -> Tensor:
     """Return the mean over seeds of the worst tenth, (), from (S, N, B, V)."""
-    worst = worst_view(scores).sort(1).values
-    return worst[:, : math.ceil(0.1 * worst.shape[1] - 1e-9)].mean()
+    return worst_decile(worst_view(scores)).mean()
 
 
 def resampled(arms: Sequence[Tensor], photograph: Tensor | None) -> Tensor:

@@ -183,9 +183,9 @@ class DeconvolvedError:
             moves: m, (P, 2, N), mm.
         """
         frequency, _ = self._frequencies(points)
-        waves = self._waves(points, frequency)  # (F, N), what each ray adds to its H
-        turn = (-2.0 * math.pi / self.photographs.pitch) * frequency  # of the phase, per mm
-        transfer = torch.view_as_real(self.transfer(points)).requires_grad_()
+        turn = self._turn * frequency
+        waves = self._waves(points, frequency)
+        transfer = torch.view_as_real(self._summed(waves)).requires_grad_()
         with torch.enable_grad():
             loss = self._loss(torch.view_as_complex(transfer))
             (gradient,) = torch.autograd.grad(loss, transfer, create_graph=True)
@@ -193,7 +193,7 @@ class DeconvolvedError:
         (curved,) = torch.autograd.grad(gradient, transfer, moved, is_grads_batched=True)
         found = moved.flatten(1) @ curved.flatten(1).T
         slope = torch.view_as_complex(gradient.detach()).flatten(1).conj()  # (F, 3V)
-        own = -(slope[:, 3 * self.view + self.colour] * waves).real  # (F, N)
+        own = -(slope[:, self._spot] * waves).real  # (F, N)
         matrices = torch.einsum("fk,fa,fb->kab", own, turn, turn)
         return found + torch.einsum("iak,kab,jbk->ij", moves, matrices, moves)
 
@@ -201,9 +201,8 @@ class DeconvolvedError:
         """Return ∂H/∂p·m, (P, F, V, 3, 2), real and imaginary part."""
         count, views = len(moves), len(self.filters)
         found = waves.new_zeros((waves.shape[0], 3 * views, count))
-        of_ray = 3 * self.view + self.colour
         for number in range(3 * views):
-            own = torch.nonzero(of_ray == number).flatten()
+            own = torch.nonzero(self._spot == number).flatten()
             for axis in range(2):
                 slope = 1j * turn[:, axis, None] * waves[:, own]
                 found[:, number] += slope @ moves[:, axis, own].T.to(slope)
@@ -246,14 +245,27 @@ class DeconvolvedError:
     def transfer(self, points: Tensor) -> Tensor:
         """Return the transfer functions H (F, V, 3), complex, of ray intercepts (2, N), mm."""
         frequency, _ = self._frequencies(points)
-        waves = self._waves(points, frequency)
-        sums = waves.new_zeros((len(frequency), 3 * len(self.filters)))
-        sums = sums.index_add(1, 3 * self.view + self.colour, waves)
+        return self._summed(self._waves(points, frequency))
+
+    @property
+    def _spot(self) -> Tensor:
+        """Return the number of each ray's view and colour, (N,), of 3V."""
+        return 3 * self.view + self.colour
+
+    def _summed(self, waves: Tensor) -> Tensor:
+        """Return H (F, V, 3) of what each ray adds to it (F, N)."""
+        sums = waves.new_zeros((len(waves), 3 * len(self.filters)))
+        sums = sums.index_add(1, self._spot, waves)
         return sums.unflatten(1, (len(self.filters), 3))
+
+    @property
+    def _turn(self) -> float:
+        """Return by how much a ray's phase turns, radians a mm, at one cycle a pixel."""
+        return -2.0 * math.pi / self.photographs.pitch
 
     def _waves(self, points: Tensor, frequency: Tensor) -> Tensor:
         """Return what each ray adds to its transfer function, (F, N), complex."""
-        phase = (-2.0 * math.pi / self.photographs.pitch) * (frequency @ points)
+        phase = self._turn * (frequency @ points)
         pixel = torch.sinc(frequency).prod(-1)
         return torch.polar(pixel[:, None] * self.share.to(points), phase)
 

@@ -61,7 +61,7 @@ class DeconvolvedRestoration(Restoration):
 
     def filtered(self, raw: Tensor, point_spread_functions: Tensor) -> Tensor:
         """Return e, the pictures (B, 3, H, W) of the deconvolution alone, sRGB-encoded."""
-        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions))[:, 0]
+        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions)[:, 0])
 
     def forward(
         self,

@@ -79,9 +79,9 @@ class UnrolledSplittingRestoration(Restoration):
             for _ in range(stages + 1)
         )
 
-    def filtered(self, raw: Tensor, point_spread_functions: Tensor) -> Tensor:
+    def filtered(self, raw: Tensor, point_spread_functions: Tensor | None) -> Tensor:
         """Return the pictures (B, 3, H, W) of the first deconvolution alone, sRGB-encoded."""
-        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions))[:, 0]
+        return linear_to_srgb(self.wiener(raw.to(self.dtype), point_spread_functions)[:, 0])
 
     def forward(
         self,
@@ -98,7 +98,7 @@ class UnrolledSplittingRestoration(Restoration):
         if self.needs_field:
             required_field(field, type(self).__name__)
         raw = raw.to(self.dtype)
-        first = encoded = linear_to_srgb(self.wiener(raw, point_spread_functions)[:, 0])
+        first = encoded = self.filtered(raw, point_spread_functions)
         assert point_spread_functions is not None  # the deconvolution has looked
         functions, margin = point_spread_functions.to(raw), self.wiener.margin
         for prior, penalty in zip(self.priors[:-1], self.log_penalty.exp(), strict=True):

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Imaging
-from dolens.optics.departures import departures
 from dolens.optics.lens import Lens
 from dolens.sensor.psf_noise import noisy_point_spread_functions
-from dolens.tolerancing import tolerances_from
+from dolens.tolerancing import assembled, tolerances_from
 
 
 class Miscalibration(Protocol):
@@ -91,12 +90,7 @@ class OtherSample:
         """Return the functions of a lens whose errors are drawn."""
         tolerances = tolerances_from(lens, self.tolerances, self.factor)
         (errors,) = tolerances.draw(1, generator)
-        stored = departures(lens)
-        stored |= {name: parameter.detach() for name, parameter in lens.named_parameters()}
-        made = dict(values)
-        for name, error in zip(tolerances.names, errors, strict=True):
-            nominal = values.get(name, stored[name])
-            made[name] = nominal + error.to(nominal)
+        made = assembled(lens, values, tolerances, errors, None)
         return views.point_spread_functions(lens, made)
 
 

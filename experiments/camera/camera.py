@@ -193,9 +193,7 @@ class CameraModule(Camera):
     def on_train_start(self) -> None:
         """Design the lens before the first step, where its optimizer begins so."""
         if self.global_step == 0:
-            with named_stage("designing the lens for its deconvolved error"):
-                knows_blur = self.network.needs_point_spread_function
-                self.lens_steps.begin(knows_blur, self.view_norm)
+            self.lens_steps.begin(self.network.needs_point_spread_function, self.view_norm)
 
     def on_train_epoch_start(self) -> None:
         """Let the renderer look at the lens as it is now.
@@ -323,7 +321,6 @@ class CameraModule(Camera):
                     made_lens_scores(self, self.manufacture.at_factor(factor), crops, of)
                     for factor in self.manufacture.settings.judged_factors
                 ]
-
         if "test" in self.test_scores:
             logger.info("%s", gain_line(self.test_scores["test"]))
 

@@ -76,7 +76,7 @@ def design_for_deconvolution(
     Raises:
         InputError: rays fail where training begins.
     """
-    first, reached, made = math.nan, math.inf, 0
+    first, reached, made = math.nan, math.nan, 0
     for _ in range(_ROUNDS):
         merit = merit_of(lens, variables, views, operands, strength, view_norm)
         steps = DampedLeastSquares(
@@ -91,15 +91,13 @@ def design_for_deconvolution(
                 "training begins; allowed there: 0"
             )
         first = begun if made == 0 else first
-        found = begun
+        reached = begun
         while made < iterations and steps.stopped is None:
-            found, made = float(steps.step(merit)), made + 1
+            reached, made = float(steps.step(merit)), made + 1
         variables.project()
         variables.write_to(lens)
-        if made >= iterations or begun - found <= _WORTH * begun:
-            reached = found
+        if made >= iterations or begun - reached <= _WORTH * begun:
             break
-        reached = found
     logger.info(
         "The lens was designed for its deconvolved error in %d iterations: %.4g, before %.4g",
         made,

@@ -17,6 +17,7 @@ from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
+from dolens.stages import stage as named_stage
 
 
 class LensSteps:
@@ -73,16 +74,17 @@ class LensSteps:
         if least_squares is None or not len(self.variables) or not least_squares.first_iterations:
             return
         strength = least_squares.strength
-        self.first = design_for_deconvolution(
-            self.lens,
-            self.variables,
-            self._views,
-            self.operands,
-            least_squares.first_iterations,
-            least_squares.first_damping,
-            float(knows_blur) if strength is None else strength,
-            view_norm,
-        )
+        with named_stage("designing the lens for its deconvolved error"):
+            self.first = design_for_deconvolution(
+                self.lens,
+                self.variables,
+                self._views,
+                self.operands,
+                least_squares.first_iterations,
+                least_squares.first_damping,
+                float(knows_blur) if strength is None else strength,
+                view_norm,
+            )
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the operands add to the loss, and their values by label."""

@@ -72,14 +72,14 @@ class MadeLensScores:
             "made/psnr_db/as_drawn": float(self.as_drawn.amin()),
             "made/psnr_db/mean": float(worst.mean()),
             "made/psnr_db/median": float(worst.median()),
-            "made/psnr_db/worst_decile": float(_worst_decile(worst)),
+            "made/psnr_db/worst_decile": float(worst_decile(worst)),
             "made/yield": float((worst >= self.passing).double().mean()),
             "cost/made_lens_s": self.seconds,
         }
         if len(worst) > 1:
             generator = torch.Generator().manual_seed(_SEED)
             rows = torch.randint(len(worst), (_RESAMPLES, len(worst)), generator=generator)
-            drawn = _worst_decile(worst[rows])
+            drawn = worst_decile(worst[rows])
             ends = torch.tensor([0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL], dtype=drawn.dtype)
             for end, value in zip(("low", "high"), drawn.quantile(ends).tolist(), strict=True):
                 found[f"error/made/psnr_db/worst_decile/{end}"] = value
@@ -145,7 +145,7 @@ def spread_over_photographs(photographs: Sequence[str], count: int) -> list[int]
     return sorted(number for _, number in sorted(ranked)[:count])
 
 
-def _worst_decile(worst: Tensor) -> Tensor:
+def worst_decile(worst: Tensor) -> Tensor:
     """Return the mean of the lowest tenth of scores (..., N), of one of them at least."""
     count = max(1, math.ceil(_DECILE * worst.shape[-1] - 1e-9))
     return worst.sort(-1).values[..., :count].mean(-1)

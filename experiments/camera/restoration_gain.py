@@ -1,6 +1,6 @@
 """The gain of restored images over simpler pictures of the same photographs, with its interval."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -33,24 +33,31 @@ class RestorationGain(NamedTuple):
     interval: Interval
 
 
-def restoration_gains(scores: PhotographScores) -> Iterator[RestorationGain]:
-    """Yield the gains of one test, for the mean over the views, each view, and the worst.
+def restoration_gains(scores: PhotographScores, views: Sequence[str]) -> Iterator[RestorationGain]:
+    """Yield the gains of one test.
 
     At the worst view the gain is that of the worst view of either: they may be two.
+
+    Args:
+        scores: of the test.
+        views: labels, `worst`, or empty for the mean over the views; see `statistics_of`.
     """
+    statistics = statistics_of(scores.views)
     for name, (other, _) in OVER.items():
         if other not in scores.metrics:
             continue
         sides = [scores.metrics[metric].double()[None] for metric in ("psnr_db", other)]
-        for view, statistic in statistics_of(scores.views).items():
-            interval = gain_interval(*sides, statistic, torch.Generator().manual_seed(0))
+        for view in views:
+            interval = gain_interval(*sides, statistics[view], torch.Generator().manual_seed(0))
             yield RestorationGain(name, view, interval)
 
 
 def gain_numbers(scores: PhotographScores, stage: str) -> dict[str, float]:
-    """Return gains and the ends of their intervals, by the names of metrics."""
+    """Return gains and the ends of their intervals, by the names of metrics: of the mean over the
+    views, each view, and the worst.
+    """
     numbers = {}
-    for gain in restoration_gains(scores):
+    for gain in restoration_gains(scores, list(statistics_of(scores.views))):
         key = f"{stage}/{gain.name}" + (f"/{gain.view}" if gain.view else "")
         found = gain.interval
         numbers |= {key: found.estimate}
@@ -62,8 +69,7 @@ def gain_line(scores: PhotographScores) -> str:
     """Return a sentence that says the gains at the worst view, with their intervals."""
     said = [
         f"{format_interval(gain.interval, 2)} dB over {OVER[gain.name][1]}"
-        for gain in restoration_gains(scores)
-        if gain.view == "worst"
+        for gain in restoration_gains(scores, ["worst"])
     ]
     return (
         f"Restored images at the worst of {', '.join(scores.views)}: {'; '.join(said)} "

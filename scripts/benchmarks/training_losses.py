@@ -1,11 +1,8 @@
 """The training losses of the camera experiments as functions of their lenses' parameters."""
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from torch import Tensor
 
@@ -13,8 +10,8 @@ from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from dolens.optics.lens import Lens
 from dolens.rendering.gradient_check import Loss
+from scripts.composed import composed
 
-ROOT = Path(__file__).resolve().parents[2]
 _SMALL = (
     "lens_dtype=float64",
     "renderer=rays",
@@ -38,10 +35,7 @@ _BATCH = 2
 def training_losses() -> Iterator[tuple[str, Lens, Loss, list[str]]]:
     """Title, lens, loss, and the names of the experiment's own variables."""
     for name, overrides in _EXPERIMENTS.items():
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            overrides = [f"experiment={name}", *overrides]
-            cfg = compose("train", overrides, return_hydra_config=True)
-            HydraConfig.instance().set_config(cfg)
+        with composed([f"experiment={name}", *overrides]) as cfg:
             lens = build_lens(RunSettings.of(cfg))
             module = instantiate(cfg.module)(lens=lens).double()
         module.eval()  # no statistics that move from call to call

@@ -3,24 +3,19 @@
 import logging
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import lightning
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import build_lens
+from scripts.composed import composed
 
-_ROOT = Path(__file__).resolve().parents[2]
 # Steps of two short trainings, whose difference tells what a step costs.
 _SHORT, _LONG = 5, 20
 
@@ -97,8 +92,8 @@ class Trainings:
         return self._step_costs[key]
 
     def _made(self, overrides: Sequence[str], seed: int) -> tuple[CameraModule, Any, str]:
-        with _composed([*overrides, *self._data, f"seed={seed}", "threads=1"]) as composed:
-            cfg = checked(composed)
+        with composed([*overrides, *self._data, f"seed={seed}", "threads=1"]) as found:
+            cfg = checked(found)
             settings = RunSettings.of(cfg)
             lightning.seed_everything(seed, workers=True, verbose=False)
             module = instantiate(settings.module)(lens=build_lens(settings))
@@ -129,13 +124,3 @@ def _fit(module: CameraModule, data: Any, steps: int) -> float:
     begun = time.process_time()
     trainer.fit(module, data)
     return time.process_time() - begun
-
-
-@contextmanager
-def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
-    with initialize_config_dir(str(_ROOT / "conf"), version_base="1.3"):
-        cfg = compose(
-            "train", [*overrides, "hydra.run.dir=outputs/co_designs"], return_hydra_config=True
-        )
-        HydraConfig.instance().set_config(cfg)
-        yield cfg

@@ -1,15 +1,11 @@
 """Images of one lens that does not change, made once, so that networks alone are compared."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 from torch import Tensor
 
 from dolens.experiments.camera.base import Camera
@@ -21,8 +17,8 @@ from dolens.reconstruction import Restoration
 from dolens.scene.planar import pinhole_image
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
+from scripts.composed import composed
 
-ROOT = Path(__file__).resolve().parents[2]
 _NOISE = 7919  # apart from the seeds of rendering
 
 
@@ -73,7 +69,7 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
             are made.
         training: whether training and validation images are made too, or test images alone.
     """
-    with _composed(overrides) as cfg:
+    with composed(overrides) as cfg:
         camera = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
         data = instantiate(cfg.data)
     if not file.is_file():
@@ -90,16 +86,8 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
 
 def composed_network(overrides: Sequence[str]) -> Restoration:
     """Return the network that `train.py` would make, of new weights."""
-    with _composed(overrides) as cfg:
+    with composed(overrides) as cfg:
         return instantiate(cfg.network)
-
-
-@contextmanager
-def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("train", list(overrides), return_hydra_config=True)
-        HydraConfig.instance().set_config(cfg)
-        yield cfg
 
 
 def _made(camera: Camera, data: CropDataModule, split: str) -> Split:

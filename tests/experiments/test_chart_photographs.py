@@ -1,6 +1,5 @@
 """A camera's prescription from photographs of a chart, as a run: tables, metrics, files."""
 
-import csv
 import json
 import math
 
@@ -17,6 +16,7 @@ from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
 from dolens.experiments.running.training import run
 from dolens.optics.elements import Element
 from dolens.sensor.pixels import Sensor
+from tests.experiments.run_tables import table
 
 PITCH = 0.0069
 SMALL = [
@@ -43,11 +43,6 @@ SIMULATED = [
     "restoration.size=33",
     "restoration.crop=96",
 ]
-
-
-def table(folder, name):
-    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_drawn_cameras_are_fitted_and_their_scenes_restored(composed, tmp_path):

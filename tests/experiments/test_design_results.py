@@ -1,6 +1,5 @@
 """What the experiments of classical design reach, and what an independent tracer says of it."""
 
-import csv
 import json
 
 import pytest
@@ -9,6 +8,7 @@ import torch
 from dolens import load_lens
 from dolens.experiments.running.training import run
 from dolens.optimize import MeritSettings
+from tests.experiments.run_tables import rows_of
 from tests.optics import exact
 
 QUIET = ["callbacks.pictures=null", "+trainer.enable_progress_bar=false"]
@@ -16,11 +16,6 @@ QUIET = ["callbacks.pictures=null", "+trainer.enable_progress_bar=false"]
 
 def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text())
-
-
-def rows_of(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def rms_um_traced_again(lens, spots, spot, every):

@@ -1,6 +1,5 @@
 """Training by several processes, by accumulated batches and in half precision, against one run."""
 
-import csv
 import json
 import os
 import subprocess
@@ -30,6 +29,7 @@ from dolens.scene.planar import PlanarScene
 from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
+from tests.experiments.run_tables import rows_of
 from tests.experiments.test_field_views import LINES, WHOLE, doublet
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
@@ -74,10 +74,6 @@ def agree(one, other, tolerance=1e-5):
 
 def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text())
-
-
-def rows_of(table):
-    return list(csv.DictReader(table.read_text().splitlines()))
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The contract between a run and its module: what a run refuses, and what an analysis leaves."""
 
-import csv
 import json
 
 import lightning
@@ -10,6 +9,7 @@ from matplotlib.figure import Figure
 
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.running.training import run
+from tests.experiments.run_tables import table
 
 EXPERIMENT = """
 # @package _global_
@@ -95,11 +95,6 @@ def own(composed, tmp_path):
         return composed("experiment=chromatic", *quiet, *overrides)
 
     return build
-
-
-def table(folder, name):
-    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_an_analysis_of_ones_own_leaves_its_numbers_tables_and_figures(own, tmp_path):

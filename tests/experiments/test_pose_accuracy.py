@@ -1,6 +1,5 @@
 """What limits a pose fit, as a run."""
 
-import csv
 import json
 import math
 
@@ -8,6 +7,7 @@ import pytest
 from tiny_experiment import figure_names
 
 from dolens.experiments.running.training import run
+from tests.experiments.run_tables import rows_of
 
 # Workers could take every task of these runs.
 pytestmark = pytest.mark.usefixtures("pickled_tasks")
@@ -33,11 +33,6 @@ TINY = [
     "basin.stages=[{optimizer: dls, iterations: 12}]",
     "+trainer.enable_progress_bar=false",
 ]
-
-
-def rows_of(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_errors_fall_with_light_and_rays_and_near_starts_converge(composed, tmp_path):

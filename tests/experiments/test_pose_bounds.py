@@ -1,12 +1,12 @@
 """How well poses can be known, by arrangement, as a run."""
 
-import csv
 import json
 
 import pytest
 from tiny_experiment import figure_names
 
 from dolens.experiments.running.training import run
+from tests.experiments.run_tables import rows_of
 
 # Workers could take every task of these runs.
 pytestmark = pytest.mark.usefixtures("pickled_tasks")
@@ -21,11 +21,6 @@ TINY = [
     "imager.rim=0.01",
     "+trainer.enable_progress_bar=false",
 ]
-
-
-def rows_of(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(composed, tmp_path):

@@ -1,6 +1,5 @@
 """Coverage of pose bounds over many measurements, with and without what the model has not."""
 
-import csv
 import json
 
 import pytest
@@ -9,6 +8,7 @@ from tiny_experiment import figure_names
 
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
+from tests.experiments.run_tables import rows_of
 
 # Workers could take every task of these runs.
 pytestmark = pytest.mark.usefixtures("pickled_tasks")
@@ -35,11 +35,6 @@ COVERAGE = [
     "~cases.all",
     "cases.radius_and_index={radius: 0.006, index: 0.0}",
 ]
-
-
-def rows_of(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_bounds_hold_where_the_model_does_and_a_lens_with_errors_breaks_them(composed, tmp_path):

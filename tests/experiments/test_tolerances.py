@@ -1,6 +1,5 @@
 """The tolerances of a lens as a run: tables, metrics, figures, and bad input."""
 
-import csv
 import json
 import math
 
@@ -11,6 +10,7 @@ from tiny_experiment import figure_names
 from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.training import run
+from tests.experiments.run_tables import table
 
 # The whole path, with few rays; the fields are aimed one by one, which takes most of the time.
 SMALL = [
@@ -31,11 +31,6 @@ FIGURES = {
     "yield",
     "worst_offenders",
 }
-
-
-def table(folder, name):
-    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_run_leaves_tables_figures_and_metrics_that_agree(composed, tmp_path):
