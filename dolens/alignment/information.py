@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.noise_weighted import deviation, exposure_of
+from dolens.alignment.noise_weighted import deviation, exposure_of, spill_left
 from dolens.alignment.pose import Pose
 from dolens.optics.row_jacobian import forward_columns
 from dolens.rendering.spot_image import SpotImager
@@ -162,7 +162,8 @@ def fisher_information(
     Rarely needed:
         slopes: makes their derivatives; None: `imager` does.  Few rays in narrow patches of light
             make derivatives rough, and a rough image would seem to tell more than it can: patches
-            should be wide enough that some ten rays cross each edge of a pixel.
+            should be wide enough that some ten rays cross each edge of a pixel.  What they spill
+            onto dark pixels is left out; see `spill_left`.
         blur: of noise and derivatives, pixels, where rays are too few for that; see
             `FisherInformation`.
     """
@@ -173,7 +174,8 @@ def fisher_information(
 
     shares, columns = forward_columns(images, point)
     if slopes is not None:
-        shares = images(point, imager)
+        wide, shares = shares, images(point, imager)
+        columns = columns * spill_left(shares, wide)[..., None]
     columns = columns / pose.scale
     exposure, noise = deviation(shares, measurement)
     rows = []

@@ -25,49 +25,62 @@ class NoiseWeightedLoss:
 
     A narrow patch of light about each ray makes true images, and rough derivatives of them: of the
     few rays near a pixel's edge.  So within an iteration I moves as images of wider patches do, and
-    is right where that begins: I(u) = I_wide(u) + I_narrow(u₀) - I_wide(u₀).  What an iteration
-    makes small is smooth then, and iterations rest where I_wide'ᵀ·(N·I_narrow - M)/σ² = 0.
+    is right where that begins: I(u) = I_narrow(u₀) + c·(I_wide(u) - I_wide(u₀)).  What an iteration
+    makes small is smooth then, and iterations rest where (c·I_wide')ᵀ·(N·I_narrow - M)/σ² = 0.
+    c is 1, and less where wide patches spill light onto pixels that are dark (`spill_left`).
 
     Where light is spread over so many pixels that few rays are left for each, derivatives are rough
     still, and tell more than there is.  G convolves what is compared, so that they are averaged; g
     is what it leaves of noise's variance.
 
+    Far from the solution σ² is a wall about the light: where the model leaves a pixel dark, σ_r is
+    far less than what a shift by part of a pixel brings there, so that J is steep, steps are short
+    or refused, and hundreds of iterations make no way.  `noise_blur` spreads the light that makes
+    noise: σ² = B(max(N·I, 0) + M)/2 + σ_r², B being a Gaussian.  It is no larger where there is no
+    light within reach, and weighs as Fisher's scoring does once it is 0.
+
     Attributes:
         measurement: M.
         imager: makes I.
         blur: standard deviation of G, a Gaussian, pixels; 0 for none.
+        noise_blur: standard deviation of B, pixels; 0: σ² is the model's.
         slopes: makes I_wide; None: `imager` does.
         deviation: σ (S, height, width), electrons; None: to be had from `weighted_at`.
-        defect: (S, height, width), I_narrow(u₀) - I_wide(u₀), likewise.
+        defect: (S, height, width), I_narrow(u₀) - c·I_wide(u₀), likewise.
+        left: c (S, height, width), likewise.
     """
 
     measurement: Measurement
     imager: SpotImager
     slopes: SpotImager | None = None
     blur: float = 0.0
+    noise_blur: float = 0.0
     deviation: Tensor | None = None
     defect: Tensor | None = None
+    left: Tensor | None = None
 
     @torch.no_grad()
     def weighted_at(self, pose: Pose) -> "NoiseWeightedLoss":
         """Return the loss with σ and I of an iteration that begins at the pose."""
         shares = torch.stack([found.image for found in pose.images(self.imager)])
-        defect = torch.zeros_like(shares)
+        wide = shares
         if self.slopes is not None:
-            defect = shares - torch.stack([found.image for found in pose.images(self.slopes)])
-        sigma = deviation(shares, self.measurement)[1]
-        return replace(self, deviation=sigma, defect=defect)
+            wide = torch.stack([found.image for found in pose.images(self.slopes)])
+        left = spill_left(shares, wide)
+        sigma = blurred_deviation(shares, self.measurement, self.noise_blur)
+        return replace(self, deviation=sigma, defect=shares - left * wide, left=left)
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
         """Return r with ε = |r|²: all pixels, image after image; zero where they are not
         trusted.
         """
-        if self.deviation is None or self.defect is None:
+        if self.deviation is None or self.defect is None or self.left is None:
             return self.weighted_at(pose).residuals(pose, scaled)
         mask, parts = self.measurement.mask, []
         for number, found in enumerate(pose.images(self.slopes or self.imager, scaled)):
             sigma, trusted = self.deviation[number], mask[number]
-            own = torch.where(trusted, (found.image + self.defect[number]) / sigma, 0.0)
+            image = self.left[number] * found.image + self.defect[number]
+            own = torch.where(trusted, image / sigma, 0.0)
             measured = torch.where(trusted, self.measurement.images[number] / sigma, 0.0)
             # Where no light falls on the pixels, no exposure explains what they saw.
             power = own.square().sum().clamp(min=torch.finfo(own.dtype).tiny)
@@ -86,6 +99,25 @@ class NoiseWeightedLoss:
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
+def spill_left(narrow: Tensor, wide: Tensor) -> Tensor:
+    """Return by how much derivatives of images of wide patches count, between 0 and 1.
+
+    A pixel behind a sharp rim is dark, and stays so when the rim moves by less than its distance.
+    Wide patches spill light there, whose derivative would say that the pixel sees every motion: of
+    one that is known to some electrons, it would tell more than all others.  So it counts less
+    where narrow patches bring less than half the light: 2·I_narrow/I_wide.
+
+    Args:
+        narrow: (..., height, width), shares of light.
+        wide: the same by wide patches.
+
+    Returns:
+        (..., height, width).
+    """
+    least = torch.finfo(wide.dtype).tiny
+    return torch.where(wide > 0.0, 2.0 * narrow / wide.clamp(min=least), 1.0).clamp(max=1.0)
+
+
 def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]:
     """Return the exposure of images and the standard deviation of their pixels.
 
@@ -98,9 +130,37 @@ def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]
     """
     exposure = exposure_of(shares, measurement)
     expected = exposure * shares
+    return exposure, _deviation_of(expected, measurement)
+
+
+def blurred_deviation(shares: Tensor, measurement: Measurement, blur: float) -> Tensor:
+    """Return the standard deviation of pixels by the light of their neighbourhood, electrons.
+
+    σ² = B(N·shares + M)/2 + σ_r²: the mean of what is expected and what is measured, blurred; where
+    pixels are not trusted, what is expected alone.
+
+    Args:
+        shares: (S, height, width), of the light behind the lens.
+        measurement: M.
+        blur: standard deviation of B, a Gaussian, pixels; 0: that of `deviation`.
+
+    Returns:
+        (S, height, width).
+    """
+    exposure, sigma = deviation(shares, measurement)
+    if blur == 0.0:
+        return sigma
+    expected = exposure * shares
+    measured = torch.where(measurement.mask, measurement.images.clamp(min=0.0), expected)
+    light = 0.5 * blurred(expected + measured, blur)
+    return _deviation_of(light, measurement)
+
+
+def _deviation_of(light: Tensor, measurement: Measurement) -> Tensor:
+    """Return the standard deviation of pixels that expect this light, electrons."""
     # Without read noise a dark pixel would know everything.
-    least = 1e-9 * float(expected.max())
-    return exposure, (expected.clamp(min=least) + measurement.read_noise**2).sqrt()
+    least = 1e-9 * float(light.max())
+    return (light.clamp(min=least) + measurement.read_noise**2).sqrt()
 
 
 def exposure_of(images: Tensor, measurement: Measurement) -> Tensor:

@@ -28,7 +28,12 @@ from dolens.experiments.poses.bench import (
 )
 from dolens.experiments.poses.bounds_figures import bounds_figures
 from dolens.experiments.poses.results import spread_metrics
-from dolens.experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
+from dolens.experiments.poses.settings import (
+    ImageSettings,
+    blur_for,
+    slopes_imager,
+    values_imager,
+)
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
@@ -244,7 +249,7 @@ class BoundsModel:
         number, pose = task
         measured = self._measurement(number, pose, 0)
         wavelength, settings = self.bench.wavelength, self.images
-        own = spot_imager(measured, wavelength, settings.imager)
+        own = values_imager(measured, wavelength, settings.imager)
         slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
         return fisher_information(pose, own, measured, slopes, blur_for(measured, slopes))
 

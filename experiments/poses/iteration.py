@@ -11,7 +11,13 @@ from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageLoss, ImageMerit, SpotLoss
-from dolens.experiments.poses.settings import Stage, blur_for, slopes_imager, spot_imager
+from dolens.experiments.poses.settings import (
+    Stage,
+    blur_for,
+    slopes_imager,
+    spot_imager,
+    values_imager,
+)
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
 
@@ -32,10 +38,11 @@ def loss_of(
         imager: settings of the experiment's, see `spot_imager`.
         centroid_weight: of the experiment, μ of S21, 1/mm².
     """
-    own = spot_imager(measurement, wavelength, imager, stage.imager)
     if stage.loss == "noise_weighted":
+        own = values_imager(measurement, wavelength, imager, stage.imager)
         slopes, blur = slopes_of(stage, measurement, wavelength, imager)
-        return NoiseWeightedLoss(measurement, own, slopes, blur)
+        return NoiseWeightedLoss(measurement, own, slopes, blur, stage.noise_blur)
+    own = spot_imager(measurement, wavelength, imager, stage.imager)
     weight = centroid_weight if stage.centroid_weight is None else stage.centroid_weight
     # From afar an image near focus is found by wide patches, those of the widest image.
     return SpotLoss(measurement, replace(own, subpixels_of=None), weight, stage.blur or 0.0)

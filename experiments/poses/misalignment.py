@@ -27,7 +27,7 @@ from dolens.experiments.poses.results import (
     spread_columns,
     spread_metrics,
 )
-from dolens.experiments.poses.settings import FitPlan, spot_imager
+from dolens.experiments.poses.settings import FitPlan, values_imager
 from dolens.experiments.tables import Row, write_table
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
@@ -130,7 +130,7 @@ class MisalignmentModule(Experiment):
     def finest(self, number: int) -> SpotImager:
         """Return the imager of a fit's last stage, by which its result is judged."""
         settings = (self.plan.imager, self.stages[-1].imager)
-        return spot_imager(self.measurement(number), self.wavelength, *settings)
+        return values_imager(self.measurement(number), self.wavelength, *settings)
 
     # ---------------------------------------------------------------- iterations
 

@@ -16,7 +16,9 @@ from dolens.typed_values import call_with_settings, check_type
 OPTIMIZERS = ("adam", "dls")
 LOSSES = ("s21", "noise_weighted")
 AUTO = "auto"
-_SPACINGS, _FINEST = 1.2, 128
+_SPACINGS, _FINEST = 1.2, 1 << 14
+# Rays of a pixel beyond which their moiré is below the shot noise of the light that cameras hold.
+_RAYS_WITHOUT_MOIRE = 2000.0
 # Derivatives are differences of what crosses a pixel's edges: by so much wider are their patches.
 _SLOPES_WIDENED = 2.0
 _RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
@@ -44,13 +46,15 @@ class Stage:
         iterations: how many.
         learning_rate: of Adam, in u.
         damping: of least squares' first step.
-        loss: `s21`, or `noise_weighted`, which reaches the bound but wants a start near the pose.
+        loss: `s21`, or `noise_weighted`, which reaches the bound; from afar it wants `noise_blur`.
         imager: settings of `SpotImager` that differ from the experiment's.
         slopes: those that differ from this stage's for derivatives, of `noise_weighted`.
         variables: names that move; None: all of the fit's.
         centroid_weight: μ (1/mm²) of this stage, of S21; None: the experiment's.
         blur: of what is compared, pixels; see `SpotLoss` and `NoiseWeightedLoss`; None, of the
             second: as much as the rays' number asks for.
+        noise_blur: of the light that makes noise, pixels, of `noise_weighted`: some let it start
+            from afar, 0 reaches the bound.
     """
 
     optimizer: str
@@ -63,12 +67,16 @@ class Stage:
     variables: tuple[str, ...] | None = None
     centroid_weight: float | None = None
     blur: float | None = None
+    noise_blur: float = 0.0
 
     def __post_init__(self) -> None:
         for key, allowed in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
             check_choice(getattr(self, key), allowed, f"stages: {key}")
         if self.loss != "s21" and self.centroid_weight is not None:
             raise InputError(f"stages: centroid_weight is of loss s21, not {self.loss}")
+        if self.noise_blur and self.loss != "noise_weighted":
+            raise InputError(f"stages: noise_blur is of loss noise_weighted, not {self.loss}")
+        check_not_negative("stages: noise_blur", self.noise_blur)
         if self.iterations < 1:
             raise InputError(f"stages: {self.iterations} iterations; allowed: 1 or more")
 
@@ -195,6 +203,7 @@ def spot_imager(
     wavelength: float,
     *settings: Mapping[str, Any],
     widened: float = 1.0,
+    values_only: bool = False,
 ) -> SpotImager:
     """Return the imager that models a measurement's images.
 
@@ -207,6 +216,7 @@ def spot_imager(
         wavelength: nm.
         settings: of `SpotImager`; later ones override earlier ones.
         widened: by how much `auto` is wider.
+        values_only: no derivative is taken of these images; see `values_imager`.
 
     Raises:
         InputError: an unknown key, or a number out of range.
@@ -215,8 +225,22 @@ def spot_imager(
     if not auto:
         return imager
     density = imager.rays / imager.reach**2 / measurement.lit_pixels
-    finest = (density.sqrt() / (_SPACINGS * widened)).int().clamp(1, _FINEST).tolist()
+    finer = (density / _RAYS_WITHOUT_MOIRE).clamp(min=1.0) if values_only else 1.0
+    patches = density.sqrt() / (_SPACINGS * widened) * finer
+    finest = patches.int().clamp(1, _FINEST).tolist()
     return replace(imager, subpixels=min(finest), subpixels_of=tuple(finest))
+
+
+def values_imager(
+    measurement: Measurement, wavelength: float, *settings: Mapping[str, Any]
+) -> SpotImager:
+    """Return the imager for images of which no derivative is taken.
+
+    Its `auto` patches are narrower than rays are apart where a pixel gets more than 2000: moiré is
+    below the shot noise there, while a patch that spills light beyond the edge of a caustic, if by
+    a hundredth of a pixel, lights pixels whose read noise alone would show it.
+    """
+    return spot_imager(measurement, wavelength, *settings, values_only=True)
 
 
 def slopes_imager(

@@ -11,7 +11,7 @@ from tiny_experiment import figure_names
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
-from dolens.experiments.poses.settings import blur_for, spot_imager
+from dolens.experiments.poses.settings import blur_for, spot_imager, values_imager
 from dolens.experiments.running.training import run
 from dolens.sensor.pixels import Sensor
 
@@ -111,6 +111,14 @@ def test_a_stage_may_move_some_variables_only(composed, tmp_path):
             "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, centroid_weight: 1.0}]",
             "centroid_weight is of loss s21",
         ),
+        (
+            "stages=[{optimizer: dls, iterations: 1, noise_blur: 2.0}]",
+            "noise_blur is of loss noise_weighted",
+        ),
+        (
+            "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, noise_blur: -1.0}]",
+            "stages: noise_blur: -1.0; allowed",
+        ),
         ("fits.5.held.from='30'", "fits.5.held.from: '30' is no earlier fit; allowed: 0"),
         ("+fits.5.start=1", "fits.5: unknown key 'start'"),
         ("+fits.5.truth.focus=1", "focus"),
@@ -150,29 +158,36 @@ def test_a_photograph_is_fitted_without_a_truth(composed, tmp_path):
     assert not any(name.startswith("pose_error") for name in metrics)
 
 
-def test_three_planes_tell_bench_and_lens_at_once(composed, tmp_path):
-    """Eight numbers of which one image knows a combination ten times worse."""
+@pytest.mark.parametrize(("blur", "finds"), [(4.0, True), (0.0, False)])
+def test_three_planes_tell_bench_and_lens_at_once(composed, tmp_path, blur, finds):
+    """Eight numbers of which one image knows a combination ten times worse, from 10 % and 4° off.
+
+    Weighted by the noise of the model's own light, dark pixels keep it where it is; by that of the
+    light within four pixels it finds its way.
+    """
+    own = f"{{optimizer: dls, iterations: 8, loss: noise_weighted, noise_blur: {blur}}}"
+    last = (
+        "{optimizer: dls, iterations: 3, loss: noise_weighted, damping: 1.0e-6,"
+        f" noise_blur: {min(blur, 1.0)}}}"
+    )
     run(
         composed(
             "experiment=misalignment_planes",
-            "sensor.height=32",
-            "sensor.width=32",
-            "sensor.pixel_pitch=0.2208",
-            "photons=30000",
-            "imager.rays=6000",
+            "sensor.height=64",
+            "sensor.width=64",
+            "sensor.pixel_pitch=0.1104",
+            "imager.rays=20000",
             "monte_carlo=0",
-            "stages=[{optimizer: adam, iterations: 25, learning_rate: 0.2},"
-            "{optimizer: dls, iterations: 10},"
-            "{optimizer: dls, iterations: 2, loss: noise_weighted, damping: 1.0e-6}]",
+            f"stages=[{own},{last}]",
             "+trainer.enable_progress_bar=false",
         )
     )
     with (tmp_path / "run/poses.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 8
-    for row in rows:
-        assert abs(float(row["error"])) < 6.0 * float(row["bound"]), row
-        assert float(row["bound"]) == float(row["own_bound"])
+    ratios = [abs(float(row["error"])) / float(row["bound"]) for row in rows]
+    assert (max(ratios) < 6.0) if finds else (max(ratios) > 100.0)
+    assert all(float(row["bound"]) == float(row["own_bound"]) for row in rows)
     assert figure_names(tmp_path / "run") == {"spots", "convergence_10", "corner_10"}
 
 
@@ -199,6 +214,11 @@ def test_patches_of_light_are_as_narrow_as_rays_are_dense():
     both = Measurement(images, torch.ones_like(images, dtype=torch.bool), 0.0, measured.sensor)
     imager = spot_imager(both, 622.5, {"rays": 10_000, "subpixels": "auto", "reach": 1.25})
     assert [imager.for_image(number).subpixels for number in (0, 1)] == [6, 33]
+    # Of values alone, where 16 000 rays reach each pixel, they are eight times as narrow.
+    settings = {"rays": 100_000, "subpixels": "auto", "reach": 1.25}
+    for by, narrow in ((spot_imager, 105), (values_imager, 843)):
+        assert by(both, 622.5, settings).for_image(0).subpixels == 21
+        assert by(both, 622.5, settings).for_image(1).subpixels == narrow
     # 64 and 640 rays a pixel: √((450/64 - 1)/4π) pixels, and none.
     for rays, expected in ((10_000, 0.6928), (100_000, 0.0)):
         imager = spot_imager(measured, 622.5, {"rays": rays, "reach": 1.25})
