@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dolens.alignment.chart_model import ChartModel, MarkSums
 from dolens.alignment.mark_windows import MarkWindows, WeightedSums
+from dolens.errors import InputError
 
 # A mark's located centroid is right to about a pixel: so it is weighted, and fitted first.
 _CENTROID_STEPS = 8
@@ -17,6 +18,10 @@ _LEAST_WIDTH = 1.5
 # Steps with the same derivatives, at most; how often one that does not help is halved; and they are
 # done when one is that small, in standard errors.
 _STEPS, _HALVINGS, _SMALL = 8, 5, 0.02
+# A pass ends where a parameter has moved by so many deviations of its prior; how many passes one
+# model has at most.
+_REACH, _PASSES = 4.0, 6
+_TINY, _ROUNDING = torch.finfo(torch.float64).tiny, 1e-9
 # A fit whose last step was longer than this has not come to rest.
 _REST = 0.1
 # The least variance of a pixel, electrons²; and how often noise and brightness are found in turn.
@@ -106,23 +111,31 @@ def fit_chart(models: Sequence[ChartModel], windows: MarkWindows, prior: Prior) 
     model, S those of an even background, and L·Lᵀ their covariance N·Σ w·D·Dᵀ + (b + σ_r²)·Σ D·Dᵀ.
     Brightness N and background b of each mark are free, and are found with every step (variable
     projection; Kaufman, BIT 15, 49, 1975).  Weights, covariance and derivatives are held within a
-    pass and found anew in the next.
+    pass and found anew in the next.  They hold near where the pass began: it ends when a parameter
+    has moved by four of its prior's deviations, and another begins with the same model.
 
     Args:
         models: of the camera, one for each pass, from those of few rays to that of enough; the
             first fits centroids too.
         windows: the photographs.
         prior: of the models' parameters.
+
+    Raises:
+        InputError: the fit goes where the lens gives no light.
     """
     numbers, used = _from_centroids(models[0], windows, prior)
     for model in models:
-        landed = model.landed(numbers)
-        centre, width = model.spots(numbers, landed)
-        width = width.clamp(min=_LEAST_WIDTH * model.pitch)
-        sums = windows.sums(centre, width, model.order)
-        one = _Pass.begun(model, windows, prior, sums, numbers, landed)
-        numbers, residual, jacobian, steps, converged = one.descended(numbers)
-        used += steps
+        for _ in range(_PASSES):
+            landed = model.landed(numbers)
+            centre, width = model.spots(numbers, landed)
+            width = width.clamp(min=_LEAST_WIDTH * model.pitch)
+            sums = windows.sums(centre, width, model.order)
+            one = _Pass.begun(model, windows, prior, sums, numbers, landed)
+            begun = numbers
+            numbers, residual, jacobian, steps, converged = one.descended(numbers)
+            used += steps
+            if float(((numbers - begun) / prior.deviation).abs().max()) < _REACH - _ROUNDING:
+                break
     rows = len(residual) - 2 * windows.counts.shape[0] * windows.counts.shape[1]
     return ChartFit(prior, numbers, jacobian, float(residual.square().sum()), rows, used, converged)
 
@@ -189,10 +202,14 @@ class _Pass:
         u = (numbers - self.prior.mean) / self.prior.deviation
         cost = residual.square().sum() + u.square().sum()
         count = 0
-        while count < _STEPS:
+        begun, moved = u, 0.0
+        while count < _STEPS and moved < _REACH:
             count += 1
             gradient = jacobian.mT @ residual.flatten() + u
             step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
+            # As far as the first parameter that reaches its limit.
+            room = (_REACH - (u - begun) * step.sign()) / step.abs().clamp(min=_TINY)
+            step = step * float(room.min().clamp(max=1.0))
             length = float((step / errors).abs().max())
             for _ in range(_HALVINGS):
                 tried = u + step
@@ -201,6 +218,7 @@ class _Pass:
                 new_cost = new.square().sum() + tried.square().sum()
                 if bool(new_cost <= cost):
                     u, residual, cost = tried, new, new_cost
+                    moved = float((u - begun).abs().max()) + _ROUNDING
                     break
                 step = 0.5 * step
             else:
@@ -230,7 +248,14 @@ def _factor(
     """Return the triangular root of N·Σ w·D·Dᵀ + (b + σ_r²)·Σ D·Dᵀ."""
     quiet = (dark + windows.read_noise**2).clamp(min=_LEAST_NOISE)[..., None, None]
     covariance = bright.clamp(min=1.0)[..., None, None] * found.products + quiet * sums.products
-    return torch.linalg.cholesky(covariance)
+    root, failed = torch.linalg.cholesky_ex(covariance)
+    if bool((failed > 0).any()):
+        photograph, mark = (int(i) + 1 for i in torch.nonzero(failed)[0])
+        raise InputError(
+            f"photographs: the fit came where the lens has no light for mark {mark} of photograph "
+            f"{photograph}; allowed: cameras within their tolerances"
+        )
+    return root
 
 
 def _projected(
