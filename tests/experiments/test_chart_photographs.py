@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,13 @@ from tiny_experiment import figure_names
 
 import dolens
 from dolens.alignment.chart import Chart
+from dolens.alignment.chart_fit import fit_chart
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
-from dolens.experiments.running.training import run
+from dolens.alignment.spot_intercepts import one_thread
+from dolens.experiments.poses.chart_simulation import drawn, simulated
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_module, run
 from dolens.optics.elements import Element
 from dolens.sensor.pixels import Sensor
 from tests.experiments.run_tables import table
@@ -43,6 +49,34 @@ SIMULATED = [
     "restoration.size=33",
     "restoration.crop=96",
 ]
+
+
+def test_a_camera_far_out_of_focus_is_found(composed):
+    """The 28th camera of seed 0: from weights of where its centroids put it, sums of the first pass
+    lead ten deviations of the prior away, where rays miss the lens.
+    """
+    cfg = composed("experiment=chart_photographs", "planes=[2.3,2.6,2.9]", "seed=0")
+    module = build_module(RunSettings.of(checked(cfg)))
+    specimen = drawn(
+        module.lens,
+        module.model,
+        module.prior,
+        module.tolerances,
+        module.unmodelled,
+        module.seed,
+        28,
+    )
+    seen = simulated(
+        module.model, module.prior, specimen, module.light, module.windows.search_radius
+    )
+    coarse = replace(module.model, rays=replace(module.model.rays, rings=4, arms=12))
+    with one_thread():
+        fit = fit_chart([coarse, coarse, module.model], seen, module.prior)
+    assert fit.converged
+    # χ² is known to √(2·1339) = 52; and the largest of thirty errors is below four.
+    assert fit.chi_squared == pytest.approx(fit.degrees_of_freedom, abs=4 * 52)
+    errors = (fit.numbers - specimen.truth) / fit.standard_errors
+    assert float(errors.abs().max()) < 4.0
 
 
 def test_drawn_cameras_are_fitted_and_their_scenes_restored(composed, tmp_path):
