@@ -21,7 +21,7 @@ _STEPS, _HALVINGS, _SMALL = 8, 5, 0.02
 # A pass ends where a parameter has moved by so many deviations of its prior; how many passes one
 # model has at most.
 _REACH, _PASSES = 4.0, 6
-_TINY, _ROUNDING = torch.finfo(torch.float64).tiny, 1e-9
+_TINY = torch.finfo(torch.float64).tiny
 # A fit whose last step was longer than this has not come to rest.
 _REST = 0.1
 # The least variance of a pixel, electrons²; and how often noise and brightness are found in turn.
@@ -115,8 +115,8 @@ def fit_chart(models: Sequence[ChartModel], windows: MarkWindows, prior: Prior) 
     has moved by four of its prior's deviations, and another begins with the same model.
 
     Args:
-        models: of the camera, one for each pass, from those of few rays to that of enough; the
-            first fits centroids too.
+        models: of the camera, for one pass or more each, from those of few rays to that of
+            enough; the first fits centroids too.
         windows: the photographs.
         prior: of the models' parameters.
 
@@ -134,7 +134,7 @@ def fit_chart(models: Sequence[ChartModel], windows: MarkWindows, prior: Prior) 
             begun = numbers
             numbers, residual, jacobian, steps, converged = one.descended(numbers)
             used += steps
-            if float(((numbers - begun) / prior.deviation).abs().max()) < _REACH - _ROUNDING:
+            if _in_reach((numbers - begun) / prior.deviation):
                 break
     rows = len(residual) - 2 * windows.counts.shape[0] * windows.counts.shape[1]
     return ChartFit(prior, numbers, jacobian, float(residual.square().sum()), rows, used, converged)
@@ -202,8 +202,8 @@ class _Pass:
         u = (numbers - self.prior.mean) / self.prior.deviation
         cost = residual.square().sum() + u.square().sum()
         count = 0
-        begun, moved = u, 0.0
-        while count < _STEPS and moved < _REACH:
+        begun = u
+        while count < _STEPS and _in_reach(u - begun):
             count += 1
             gradient = jacobian.mT @ residual.flatten() + u
             step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
@@ -218,7 +218,6 @@ class _Pass:
                 new_cost = new.square().sum() + tried.square().sum()
                 if bool(new_cost <= cost):
                     u, residual, cost = tried, new, new_cost
-                    moved = float((u - begun).abs().max()) + _ROUNDING
                     break
                 step = 0.5 * step
             else:
@@ -227,6 +226,12 @@ class _Pass:
                 break
         numbers = self.prior.mean + self.prior.deviation * u
         return numbers, residual.flatten(), jacobian, count, length < _REST
+
+
+def _in_reach(moved: Tensor) -> bool:
+    """Return whether parameters that moved by so many prior deviations (P,) may go on in a pass."""
+    # Rounding may leave one that was stopped at its limit a little short of it.
+    return float(moved.abs().max()) < _REACH - 1e-9
 
 
 def _root(windows: MarkWindows, sums: WeightedSums, found: MarkSums) -> Tensor:

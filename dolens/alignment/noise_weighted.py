@@ -36,7 +36,7 @@ class NoiseWeightedLoss:
     Far from the solution σ² is a wall about the light: where the model leaves a pixel dark, σ_r is
     far less than what a shift by part of a pixel brings there, so that J is steep, steps are short
     or refused, and hundreds of iterations make no way.  `noise_blur` spreads the light that makes
-    noise: σ² = B(max(N·I, 0) + M)/2 + σ_r², B being a Gaussian.  It is no larger where there is no
+    noise: σ² = B(N·I + max(M, 0))/2 + σ_r², B being a Gaussian.  It is no larger where there is no
     light within reach, and weighs as Fisher's scoring does once it is 0.
 
     Attributes:
@@ -136,8 +136,8 @@ def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]
 def blurred_deviation(shares: Tensor, measurement: Measurement, blur: float) -> Tensor:
     """Return the standard deviation of pixels by the light of their neighbourhood, electrons.
 
-    σ² = B(N·shares + M)/2 + σ_r²: the mean of what is expected and what is measured, blurred; where
-    pixels are not trusted, what is expected alone.
+    σ² = B(N·shares + max(M, 0))/2 + σ_r²: the mean of what is expected and what is measured,
+    blurred; where pixels are not trusted, what is expected alone.
 
     Args:
         shares: (S, height, width), of the light behind the lens.

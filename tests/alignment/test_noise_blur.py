@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-import yaml
 
 from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement, simulated
@@ -17,7 +16,6 @@ from dolens.alignment.noise_weighted import (
     spill_left,
 )
 from dolens.alignment.pose import Pose
-from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
@@ -32,13 +30,6 @@ TRUTH = {
     "elements.lens.tilt_x": -9.0,
     "elements.lens.tilt_y": 1.5,
 }
-
-
-@pytest.fixture
-def singlet(root):
-    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
-    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
-    return lens_from_prescription(prescription).double().requires_grad_(False)
 
 
 def pose(lens, values):

@@ -8,7 +8,6 @@ from zlib import crc32
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
 
 from dolens.alignment.information import FisherInformation, fisher_information
@@ -19,7 +18,6 @@ from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageMerit, ImageResiduals, SpotLoss
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
-from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
@@ -28,13 +26,6 @@ SOURCE = [[0.0, 0.0, -864.0]]
 TILT, SHIFT = "elements.lens.tilt_x", "elements.lens.decenter_y"
 ALL = ("decenter_x", "decenter_y", "shift_z", "tilt_x", "tilt_y")
 IMAGER = SpotImager(SENSOR, 622.5, 40_000, subpixels=1)
-
-
-@pytest.fixture
-def singlet(root):
-    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
-    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
-    return lens_from_prescription(prescription).double().requires_grad_(False)
 
 
 def pose(lens, **initial):
