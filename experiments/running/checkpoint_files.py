@@ -15,6 +15,17 @@ from dolens.whole_files import written_whole
 
 # So much of a foreign program's reason is repeated.
 _REASON = 200
+# What a checkpoint may have of Lightning's, and of which kind it is.
+_KINDS: Mapping[str, type] = {
+    "state_dict": Mapping,
+    "global_step": int,
+    "epoch": int,
+    "optimizer_states": list,
+    "lr_schedulers": list,
+    "loops": Mapping,
+    "callbacks": Mapping,
+    "pytorch-lightning_version": str,
+}
 _GLOBAL = re.compile(r"GLOBAL (\S+)")
 
 
@@ -87,7 +98,17 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
         )
     if not isinstance(found, Mapping) or "state_dict" not in found:
         raise InputError(f"{where}{path} holds no state of a module")
+    for key, kind in _KINDS.items():
+        if key in found and (not isinstance(found[key], kind) or isinstance(found[key], bool)):
+            raise InputError(f"{where}{path} is damaged: its {key} is {_shown(found[key])}")
+    for name, value in found["state_dict"].items():
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
+            raise InputError(f"{where}{path} is damaged: its {name} is {_shown(value)}")
     return found
+
+
+def _shown(value: Any) -> str:
+    return one_line(f"{type(value).__name__} {value!r}")[:_REASON]
 
 
 def _reason(error: Exception) -> str:

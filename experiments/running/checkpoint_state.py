@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.recorded_run import RecordedRun
@@ -43,21 +45,39 @@ def take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
     Raises:
         InputError: the checkpoint is of another experiment, lens or network.
     """
-    module.on_load_checkpoint(dict(state))
+    values = state["state_dict"]
     try:
-        module.load_state_dict(state["state_dict"])
-    except RuntimeError as error:
-        reason = _misfit(state["state_dict"], module.state_dict()) or one_line(error)
-        raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
-    module.settle()
+        module.on_load_checkpoint(dict(state))
+        own = module.state_dict()
+        reason = misfit(values, own) or _missing(values, own)
+        if not reason:
+            module.load_state_dict(values)
+            module.settle()
+    except InputError:
+        raise
+    except Exception as error:  # what an experiment keeps besides may be damaged in many ways
+        reason = one_line(f"{type(error).__name__}: {error}")
+        raise InputError(f"{file} does not fit the run's configuration: {reason}") from error
+    if reason:
+        raise InputError(f"{file} does not fit the run's configuration: {reason}")
 
 
-def _misfit(found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
-    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
+def misfit(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:
+    """Return the first tensor of a state that is not of a module's shape or kind; none: ''."""
     for name, value in own.items():
         if name not in found:
-            return f"{name} is missing in the checkpoint"
+            continue
         if found[name].shape != value.shape:
             shapes = tuple(found[name].shape), tuple(value.shape)
             return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
-    return next((f"there is no {name} here" for name in found if name not in own), "")
+        if found[name].is_complex() != value.is_complex():
+            return f"{name} is {found[name].dtype} in the checkpoint and {value.dtype} here"
+    return ""
+
+
+def _missing(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:
+    """Return the first name that a state or a module lacks; none: ''."""
+    missing = (f"{name} is missing in the checkpoint" for name in own if name not in found)
+    return next(
+        missing, next((f"there is no {name} here" for name in found if name not in own), "")
+    )

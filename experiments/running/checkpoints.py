@@ -7,11 +7,11 @@ from typing import Any
 
 import lightning
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, refuse_another
 from dolens.experiments.running.checkpoint_files import read_checkpoint
+from dolens.experiments.running.checkpoint_state import misfit
 from dolens.experiments.running.plain_values import flat
 
 logger = logging.getLogger(__name__)
@@ -81,7 +81,9 @@ def checked_checkpoint(
         )
     else:
         _compare(written, settings, training)
-    _refuse_other_shapes(checkpoint["state_dict"], module.state_dict())
+    reason = misfit(checkpoint["state_dict"], module.state_dict())
+    if reason:
+        raise InputError(f"ckpt_path: {reason}; resume with the settings that wrote it")
     return path
 
 
@@ -109,12 +111,3 @@ def _compare(written: Mapping[str, Any], own: Mapping[str, Any], training: bool)
 
 def _shown(settings: Mapping[str, Any], name: str) -> str:
     return repr(settings[name]) if name in settings else "not set"
-
-
-def _refuse_other_shapes(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    for name, value in own.items():
-        if name in found and found[name].shape != value.shape:
-            raise InputError(
-                f"ckpt_path: {name} has shape {tuple(found[name].shape)} in the checkpoint and "
-                f"{tuple(value.shape)} in this run; resume with the settings that wrote it"
-            )
