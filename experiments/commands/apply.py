@@ -207,9 +207,9 @@ def apply_run(
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"{twice}: two pictures of this name would write the same files")
+    into = own_folder(folder, "applied") if out is None else Path(out).expanduser().resolve()
     run = load_run(folder, checkpoint, with_loss=False, trust=trust)
     camera = PictureCamera(run, options)
-    into = own_folder(run.folder, "applied") if out is None else Path(out).expanduser().resolve()
     into.mkdir(parents=True, exist_ok=True)
     found = []
     for file in files:

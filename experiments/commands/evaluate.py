@@ -138,7 +138,7 @@ def _new_folder(folder: Path, name: str | None) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") if name is None else name
     if not name or Path(name).name != name:
         raise InputError(f"--name: '{name}'; allowed: the name of a folder, without /")
-    found = own_folder(folder.expanduser().resolve(), "evaluation") / name
+    found = own_folder(folder, "evaluation") / name
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found

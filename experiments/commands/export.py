@@ -73,8 +73,8 @@ def export_run(
     settings = settings or ExportSettings()
     for name in settings.formats:
         check_choice(name, FORMATS, "format")
+    folder = Path(folder) if folder is not None else own_folder(run, "export")
     loaded = load_run(run, settings.checkpoint, with_loss=False, trust=settings.trust)
-    folder = Path(folder) if folder is not None else own_folder(loaded.folder, "export")
     lens = copy.deepcopy(loaded.lens).double().cpu()
     design = design_hash(lens)
     drawn, tolerances = _tolerances(loaded, lens, settings.tolerances)

@@ -199,14 +199,15 @@ def _resolved(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     if resolved is not None:
         return dict(flat(resolved))
     register_resolvers()
-    cfg = OmegaConf.create(dict(config))
-    found = {}
-    for name, leaf in flat(dict(config)):
-        try:
-            value = OmegaConf.select(cfg, name) if isinstance(leaf, str) else leaf
-            found[name] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        except OmegaConfBaseException:
-            found[name] = leaf
+    found = dict(flat(dict(config)))
+    for name, leaf in found.items():
+        # What a stranger's run asks of this environment is left as it is written.
+        if isinstance(leaf, str) and "${" in leaf and "oc.env" not in leaf:
+            try:
+                value = OmegaConf.select(OmegaConf.create(dict(config)), name)
+                found[name] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+            except OmegaConfBaseException:
+                continue
     return found
 
 

@@ -17,13 +17,13 @@ from dolens.whole_files import written_whole
 _REASON = 200
 # What a checkpoint may have of Lightning's, and of which kind it is.
 _KINDS: Mapping[str, type] = {
-    "state_dict": Mapping,
+    "state_dict": dict,
     "global_step": int,
     "epoch": int,
     "optimizer_states": list,
     "lr_schedulers": list,
-    "loops": Mapping,
-    "callbacks": Mapping,
+    "loops": dict,
+    "callbacks": dict,
     "pytorch-lightning_version": str,
 }
 _GLOBAL = re.compile(r"GLOBAL (\S+)")
@@ -99,8 +99,10 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
     if not isinstance(found, Mapping) or "state_dict" not in found:
         raise InputError(f"{where}{path} holds no state of a module")
     for key, kind in _KINDS.items():
-        if key in found and (not isinstance(found[key], kind) or isinstance(found[key], bool)):
-            raise InputError(f"{where}{path} is damaged: its {key} is {_shown(found[key])}")
+        value = found.get(key, kind())
+        negative = isinstance(value, int) and (isinstance(value, bool) or value < 0)
+        if not isinstance(value, kind) or negative:
+            raise InputError(f"{where}{path} is damaged: its {key} is {_shown(value)}")
     for name, value in found["state_dict"].items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
             raise InputError(f"{where}{path} is damaged: its {name} is {_shown(value)}")

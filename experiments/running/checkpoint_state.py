@@ -48,8 +48,7 @@ def take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
     values = state["state_dict"]
     try:
         module.on_load_checkpoint(dict(state))
-        own = module.state_dict()
-        reason = misfit(values, own) or _missing(values, own)
+        reason = misfit(values, module.state_dict())
         if not reason:
             module.load_state_dict(values)
             module.settle()
@@ -63,21 +62,13 @@ def take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
 
 
 def misfit(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:
-    """Return the first tensor of a state that is not of a module's shape or kind; none: ''."""
+    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
     for name, value in own.items():
         if name not in found:
-            continue
+            return f"{name} is missing in the checkpoint"
         if found[name].shape != value.shape:
             shapes = tuple(found[name].shape), tuple(value.shape)
             return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
         if found[name].is_complex() != value.is_complex():
             return f"{name} is {found[name].dtype} in the checkpoint and {value.dtype} here"
-    return ""
-
-
-def _missing(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:
-    """Return the first name that a state or a module lacks; none: ''."""
-    missing = (f"{name} is missing in the checkpoint" for name in own if name not in found)
-    return next(
-        missing, next((f"there is no {name} here" for name in found if name not in own), "")
-    )
+    return next((f"there is no {name} here" for name in found if name not in own), "")

@@ -214,6 +214,10 @@ def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
 
 def _module(config: DictConfig, lens: Lens) -> Experiment:
     make = _made("module", config)
+    if not callable(make):
+        raise InputError(
+            "module: makes no experiment of a lens; allowed: _target_, _partial_: true"
+        )
     try:
         return make(lens=lens)
     except InputError:

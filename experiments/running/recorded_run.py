@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.plain_values import walk
@@ -22,6 +24,7 @@ from dolens.experiments.running.run_files import (
     overrides_of,
     read_yaml,
 )
+from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 
 _RECORDS = (RESOLVED, HYDRA, OVERRIDES, INFO)
@@ -102,6 +105,10 @@ def read_record(
             raise InputError(f"{folder / RESOLVED}: {path} is '{value}', and not resolved")
     if not job.output_dir or not job.sources:
         raise InputError(f"{folder / HYDRA} is not that of a run")
+    try:
+        RunSettings.of(OmegaConf.create(config))
+    except (InputError, OmegaConfBaseException) as error:
+        raise InputError(f"{folder / RESOLVED}: {one_line(error)}") from None
     try:
         now, notes = translated(overrides_of(folder))
     except HydraException as error:

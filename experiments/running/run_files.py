@@ -106,7 +106,7 @@ def overrides_of(folder: Path) -> tuple[str, ...]:
     """
     file = folder / OVERRIDES
     text = _text(file)
-    found = (plain_values(text, str(file)) if text else None) or []
+    found = [] if text is None else plain_values(text, str(file))
     _texts(file, found)
     for entry in found:
         if entry.lstrip("+~").startswith("hydra"):
@@ -165,11 +165,11 @@ def _text(path: Path) -> str | None:
     Raises:
         InputError: it is no ordinary file, is far too large, or holds no text.
     """
-    if not path.exists():
-        return None
-    if not path.is_file():
-        _refuse(path, "it is no ordinary file")
     try:
+        if not path.exists():
+            return None
+        if not path.is_file():
+            _refuse(path, "it is no ordinary file")
         if path.stat().st_size > _MOST_BYTES:
             _refuse(path, f"it is longer than {_MOST_BYTES} bytes")
         return path.read_text(encoding="utf-8")

@@ -63,7 +63,10 @@ def needing_trust(config: Mapping[str, Any], output: Path | None = None) -> list
         config: plain values, resolved or not.
         output: the folder that may be written to; None: settings that say where are passed over.
     """
-    return list(dict.fromkeys(_needs(config, output)))
+    found: dict[str, str] = {}
+    for what, place in _needs(config, output):
+        found.setdefault(what, place)
+    return [f"{what} ({place})" for what, place in found.items()]
 
 
 def refuse_untrusted(needs: list[str], folder: Path) -> None:
@@ -83,35 +86,36 @@ def refuse_untrusted(needs: list[str], folder: Path) -> None:
         )
 
 
-def own_folder(run: Path, name: str) -> Path:
+def own_folder(run: str | Path, name: str) -> Path:
     """Return a folder within a run folder, for results; it need not be there.
 
     Raises:
         InputError: it is a link or holds one, through which a file elsewhere would be written.
     """
-    folder = run / name
+    folder = Path(run).expanduser().resolve() / name
     for path in (folder, *folder.rglob("*")):
         if path.is_symlink():
             raise InputError(f"{path} is a link, and would be written through; remove it")
     return folder
 
 
-def _needs(config: Mapping[str, Any], output: Path | None) -> Iterator[str]:
+def _needs(config: Mapping[str, Any], output: Path | None) -> Iterator[tuple[str, str]]:
+    """Yield what needs trust, and the setting that asks for it."""
     if config.get("extensions"):
         given = config["extensions"]
         modules = map(str, given) if isinstance(given, list) else [str(given)]
-        yield f"import {', '.join(modules)} (extensions)"
+        yield f"import {', '.join(modules)}", "extensions"
     made = {key: value for key, value in config.items() if key not in _NOT_MADE}
     for path, value, _ in walk("", made):
         place, _, key = path.rpartition(".")
-        if key == "_target_" and value not in allowed_targets():
-            yield f"call {value} ({place})"
+        if key == "_target_" and (not isinstance(value, str) or value not in allowed_targets()):
+            yield f"call {value}", place
         elif key == "_args_":  # which would pass what is looked at by its name below
-            yield f"call {place} with arguments without names"
+            yield "give a call arguments without names", place
         elif key in _WRITTEN and output is not None and isinstance(value, str):
             if not Path(value).expanduser().resolve().is_relative_to(output):
-                yield f"write into {value} ({path})"
+                yield f"write into {value}", path
         elif key == "settings" and isinstance(value, list):
             for text in map(str, value):
                 if not _PLAIN_OVERRIDE.fullmatch(text) or "_target_" in text:
-                    yield f"start dolens train {text} ({path})"
+                    yield f"start dolens train {text}", path
