@@ -33,6 +33,9 @@ def checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
         return file
     others = sorted(path.stem for path in folder.glob("*.ckpt"))
     there = f"there is {', '.join(others)}" if others else "there is none"
+    if not record.config["train"]:
+        tested = record.config.get("ckpt_path")
+        there += ": it trained nothing" + (f", and tested {tested}" if tested else "")
     raise InputError(
         f"{record.folder}: this run ({record.status}) has no checkpoint checkpoints/{file.name}; "
         f"{there}"

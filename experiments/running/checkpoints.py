@@ -81,6 +81,12 @@ def checked_checkpoint(
         )
     else:
         _compare(written, settings, training)
+    most, epoch = settings.get("trainer.max_epochs"), checkpoint.get("epoch", 0)
+    if training and isinstance(most, int) and 0 <= most <= epoch:
+        raise InputError(
+            f"trainer.max_epochs: {most}; the checkpoint is of epoch {epoch + 1}; allowed: "
+            f"{epoch + 1}, or more to go on training"
+        )
     reason = misfit(checkpoint["state_dict"], module.state_dict())
     if reason:
         raise InputError(f"ckpt_path: {reason}; resume with the settings that wrote it")
@@ -101,10 +107,15 @@ def _compare(written: Mapping[str, Any], own: Mapping[str, Any], training: bool)
             "ckpt_path: the checkpoint is of another lens, whose state it would put in the place "
             f"of this one: {'; '.join(differences[n] for n in fixed[:_NAMED])}{more}"
         )
+    kinds = [n for n in differences if n in ("scheduler", "scheduler._target_")]
+    if training and kinds:
+        raise InputError(
+            f"ckpt_path: {differences[kinds[0]]}; a schedule goes on as one of its kind"
+        )
     if differences:
         logger.warning(
-            "ckpt_path: this run differs from the one that wrote the checkpoint: %s. Weights, "
-            "learning rates and schedules that the checkpoint holds go on as they were",
+            "ckpt_path: this run differs from the one that wrote the checkpoint: %s. Weights and "
+            "learning rates that the checkpoint holds go on as they were; schedules are this run's",
             "; ".join(differences.values()),
         )
 

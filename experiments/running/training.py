@@ -19,7 +19,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
-from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
+from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs, ResumedSchedules
 from dolens.experiments.callbacks.starvation import StarvationWarning
 from dolens.experiments.checks import check_sensor_distance
 from dolens.experiments.experiment import Experiment, check_experiment
@@ -96,7 +96,8 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     if not settings.trainer.get("enable_progress_bar", True):
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
+    callbacks += [ResumedEpochs(), ResumedSchedules(), LogsBeforeCheckpoints()]
+    callbacks.append(SettingsInCheckpoints(written))
     starvation = StarvationWarning()
     callbacks += [starvation, LoggedObjectives(settings.objectives), *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
