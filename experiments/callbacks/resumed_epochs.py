@@ -16,7 +16,12 @@ class ResumedEpochs(lightning.Callback):
 
     Lightning leaves that out.  Its next checkpoint then says that no epoch is under way, and a run
     that is resumed from that one makes the steps of the epoch again.
+
+    Attributes:
+        trained: whether any step has been made.
     """
+
+    trained = False
 
     def on_train_batch_start(
         self,
@@ -26,6 +31,7 @@ class ResumedEpochs(lightning.Callback):
         batch_idx: int,
     ) -> None:
         """Count the epoch, if it is not counted."""
+        self.trained = True
         epochs = trainer.fit_loop.epoch_progress
         if epochs.current.ready == epochs.current.completed:
             epochs.increment_ready()

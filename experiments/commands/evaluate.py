@@ -22,6 +22,7 @@ from dolens.experiments.commands.evaluation_overrides import (
 )
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import FinishedRun, load_recorded
+from dolens.experiments.running.made_trainer import quiet_lightning
 from dolens.experiments.running.matmul_precision import set_matmul_precision
 from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.run_files import (
@@ -190,6 +191,7 @@ def _tested(
     set_matmul_precision(settings.matmul_precision)
     with run.record.importable():
         callbacks = [instantiate(c) for c in (settings.callbacks or {}).values() if c]
+    quiet_lightning()
     unwanted: tuple[type, ...] = (ModelCheckpoint,)
     if not settings.trainer.get("enable_progress_bar", True):
         unwanted = (ModelCheckpoint, ProgressBar)

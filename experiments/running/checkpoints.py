@@ -87,6 +87,7 @@ def checked_checkpoint(
             f"trainer.max_epochs: {most}; the checkpoint is of epoch {epoch + 1}; allowed: "
             f"{epoch + 1}, or more to go on training"
         )
+    logger.info("Going on from %s, after %d steps", path, checkpoint.get("global_step", 0))
     reason = misfit(checkpoint["state_dict"], module.state_dict())
     if reason:
         raise InputError(f"ckpt_path: {reason}; resume with the settings that wrote it")

@@ -120,7 +120,7 @@ def _started(trainer: lightning.Trainer, threads: int | None) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="dolens-reports-") as folder:
         added[_REPORTS] = folder
         os.environ.update(added, LOCAL_RANK="0")
-        command = [sys.executable, "-m", "dolens.cli", "train", *sys.argv[1:]]
+        command = [sys.executable, "-m", "dolens", "train", *sys.argv[1:]]
         started = [
             subprocess.Popen(command, env={**os.environ, "LOCAL_RANK": str(rank)})
             for rank in range(1, count)
