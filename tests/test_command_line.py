@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from dolens import __version__
 from dolens.cli.app import main
 
 TRAINING = (
@@ -36,6 +37,11 @@ def run(*command):
 
 def without_training(*arguments):
     return run("-c", WITHOUT.format(packages=TRAINING), *arguments)
+
+
+def test_the_version_is_shown_and_the_package_runs_as_the_command():
+    assert run("-m", "dolens", "--version").stdout == f"dolens {__version__}\n"
+    assert run("-m", "dolens", "--help").stdout.split("dolens")[1:]
 
 
 def test_help_lists_every_command_without_importing_pytorch():

@@ -5,9 +5,11 @@ the commands about a lens work without the packages that training needs.
 """
 
 import sys
+from typing import Annotated
 
 import typer
 
+from dolens import __version__
 from dolens.cli.apply import apply
 from dolens.cli.check import check
 from dolens.cli.compare import compare
@@ -25,7 +27,6 @@ from dolens.spinning import choose_waiting
 
 app = typer.Typer(
     name="dolens",
-    help="Look at lenses, design them, and train cameras: optics and reconstruction together.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -41,9 +42,22 @@ def main() -> None:
         sys.exit(f"error: {one_line(error)}")
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"dolens {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def _dolens(context: typer.Context) -> None:
-    """Keep `dolens` a group of commands, and each of them to the processors it may use."""
+def _dolens(
+    context: typer.Context,
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Look at lenses, design them, and train cameras: optics and reconstruction together."""
+    # Each command keeps to the processors that it may use.
     if context.invoked_subcommand != "train":
         limit_threads()
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from dolens.cli.extras import import_extra
+from dolens.cli.extras import TRUST, import_extra
 from dolens.cli.quiet_logging import quiet_logging
 
 
@@ -65,6 +65,7 @@ def apply(
     out: Annotated[
         Path | None, typer.Option(help="The folder that is written to; by default RUN/applied.")
     ] = None,
+    trust: Annotated[bool, typer.Option("--trust", help=TRUST)] = False,
 ) -> None:
     """Show what the camera of a RUN makes of pictures: its sensor's image, and the restored one.
 
@@ -87,7 +88,7 @@ def apply(
         black_level=black_level,
         white_level=white_level,
     )
-    folder, camera, found = module.apply_run(run, pictures, options, checkpoint, out)
+    folder, camera, found = module.apply_run(run, pictures, options, checkpoint, out, trust)
     where = "whole pictures" if camera.margin is None else f"windows of {window} pixels"
     beside = "" if camera.margin is None else f" and {camera.margin} around them"
     typer.echo(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from dolens.cli.extras import import_extra
+from dolens.cli.extras import TRUST, import_extra
 from dolens.cli.quiet_logging import quiet_logging
 
 _HEADLINES = {
@@ -41,6 +41,7 @@ def evaluate(
             "as for a lens that was made a little differently.",
         ),
     ] = False,
+    trust: Annotated[bool, typer.Option("--trust", help=TRUST)] = False,
 ) -> None:
     """Test the camera of a RUN again, without training, and write RUN/evaluation/NAME.
 
@@ -50,7 +51,7 @@ def evaluate(
     """
     quiet_logging()
     module = import_extra("dolens.experiments.commands.evaluate", "train", "dolens evaluate")
-    found = module.evaluate(run, overrides or [], checkpoint, name, perturb_lens, sys.argv)
+    found = module.evaluate(run, overrides or [], checkpoint, name, perturb_lens, sys.argv, trust)
     _show(
         f"{found.run.experiment}, {found.run.step} steps", module.own_metrics(found), found.metrics
     )
@@ -60,9 +61,10 @@ def evaluate(
 def _show(title: str, own: Mapping[str, float], metrics: Mapping[str, float]) -> None:
     """Print the metrics of the test; in parentheses, by how much the run's own ones differ."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=title, caption="in parentheses: difference to the run's own test")
+    table = Table(title=escape(title), caption="in parentheses: difference to the run's own test")
     places = {name: _judge_and_view(name) for name in metrics}
     rows = {name: place for name, place in places.items() if place is not None}
     if rows:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dolens.cli.extras import import_extra
+from dolens.cli.extras import TRUST, import_extra
 from dolens.cli.quiet_logging import quiet_logging
 
 if TYPE_CHECKING:
@@ -73,6 +73,7 @@ def export(
     sag_nm: Annotated[
         float, typer.Option(help="Largest error in sag of the STEP file, nm; at most 10.")
     ] = 10.0,
+    trust: Annotated[bool, typer.Option("--trust", help=TRUST)] = False,
 ) -> None:
     """Write a lens, or the lens and the network of a run, in files for others.
 
@@ -105,7 +106,7 @@ def export(
         if is_run:
             module = import_extra("dolens.experiments.commands.export", "train", "dolens export")
             settings = module.ExportSettings(
-                formats, checkpoint, tolerances, image_size, multiple_of, sag_nm
+                formats, checkpoint, tolerances, image_size, multiple_of, sag_nm, trust
             )
             folder, exported = module.export_run(run_or_lens, out, settings, progress)
         else:

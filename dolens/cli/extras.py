@@ -5,6 +5,12 @@ from types import ModuleType
 
 from dolens.errors import InputError
 
+# What commands that load a run say of their option --trust.
+TRUST = (
+    "Let the RUN import, call and write whatever its files name, as classes of your own and "
+    "extensions: only for a folder whose maker you trust."
+)
+
 
 def import_extra(module: str, extra: str, command: str) -> ModuleType:
     """Import a module that needs the packages of an extra.

@@ -64,7 +64,9 @@ def images_picture(rung: Rung, best_spots: str) -> Figure | None:
 
 def _images(label: str, camera: RungOfForm) -> tuple[tuple[Tensor, Tensor, Tensor], list[str]]:
     """Return truth, measured and restored images of some views, and the names of these."""
-    run = load_run(camera.cameras[0].task.folder, with_loss=False)
+    run = load_run(
+        camera.cameras[0].task.folder, with_loss=False, trust=True
+    )  # this search has made it
     module = run.module
     assert isinstance(module, CameraModule)  # it has a score
     run.data.setup("test")

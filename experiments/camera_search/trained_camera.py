@@ -89,7 +89,7 @@ class CameraTask:
         checkpoint = last_checkpoint(self.folder)
         if checkpoint is not None:
             overrides.append(f"ckpt_path={override_text(str(checkpoint))}")
-        return [sys.executable, "-m", "dolens.cli", "train", *overrides]
+        return [sys.executable, "-m", "dolens", "train", *overrides]
 
 
 @dataclass(frozen=True)

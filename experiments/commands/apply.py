@@ -26,6 +26,7 @@ from dolens.experiments.commands.picture_files import (
 from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.run_files import write_json
+from dolens.experiments.running.trust import own_folder
 from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity
@@ -176,6 +177,7 @@ def apply_run(
     options: Options,
     checkpoint: str | Path = "last",
     out: str | Path | None = None,
+    trust: bool = False,
 ) -> tuple[Path, PictureCamera, list[Applied]]:
     """Apply a finished run's camera to pictures.
 
@@ -190,6 +192,7 @@ def apply_run(
         options: see `Options`.
         checkpoint: `last`, `best`, or the path of a file.
         out: where files are written; None: `applied` in the run folder.
+        trust: whether the run may call, import and write what it names; see `load_run`.
 
     Returns:
         The folder that was written to, the camera, and what was found, a picture after the other.
@@ -204,9 +207,9 @@ def apply_run(
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"{twice}: two pictures of this name would write the same files")
-    run = load_run(folder, checkpoint, with_loss=False)
+    into = own_folder(folder, "applied") if out is None else Path(out).expanduser().resolve()
+    run = load_run(folder, checkpoint, with_loss=False, trust=trust)
     camera = PictureCamera(run, options)
-    into = run.folder / "applied" if out is None else Path(out).expanduser().resolve()
     into.mkdir(parents=True, exist_ok=True)
     found = []
     for file in files:

@@ -21,11 +21,8 @@ from dolens.experiments.commands.evaluation_overrides import (
     with_own_calibration,
 )
 from dolens.experiments.running.composition import changed_places, with_overrides
-from dolens.experiments.running.finished_run import (
-    FinishedRun,
-    load_recorded,
-    working_folder_importable,
-)
+from dolens.experiments.running.finished_run import FinishedRun, load_recorded
+from dolens.experiments.running.made_trainer import quiet_lightning
 from dolens.experiments.running.matmul_precision import set_matmul_precision
 from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.run_files import (
@@ -43,6 +40,7 @@ from dolens.experiments.running.run_folder import (
 )
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import summary_of
+from dolens.experiments.running.trust import own_folder
 from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)
@@ -74,6 +72,7 @@ def evaluate(
     name: str | None = None,
     perturb_lens: bool = False,
     command: Sequence[str] = (),
+    trust: bool = False,
 ) -> Evaluated:
     """Test a run's module again, with the weights of a checkpoint.
 
@@ -94,17 +93,18 @@ def evaluate(
         perturb_lens: whether overrides may set parameters of the lens to other values, for a lens
             that was made a little differently.
         command: what was typed, for run.json.
+        trust: whether the run may call, import and write what it names; see `load_run`.
 
     Raises:
-        InputError: the folder is none of a run; an override makes another camera, or changes what
-            only training reads; or a folder of that name is there.
+        InputError: the folder is none of a run, or needs trust; an override makes another camera,
+            or changes what only training reads; or a folder of that name is there.
     """
     started = time.perf_counter()
     output = _new_folder(Path(folder), name)
-    record = read_record(folder, output)
+    record = read_record(folder, output, trust)
     refuse_other_work(overrides)
     given, overrides = list(overrides), with_own_calibration(record, overrides)
-    with working_folder_importable():
+    with record.importable():
         config = with_overrides(record, overrides)
     changed = changed_places(record.config, config)
     refuse_another_camera(changed, config, perturb_lens)
@@ -139,7 +139,7 @@ def _new_folder(folder: Path, name: str | None) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") if name is None else name
     if not name or Path(name).name != name:
         raise InputError(f"--name: '{name}'; allowed: the name of a folder, without /")
-    found = folder.expanduser().resolve() / "evaluation" / name
+    found = own_folder(folder, "evaluation") / name
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found
@@ -189,8 +189,9 @@ def _tested(
     set_threads(settings.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     set_matmul_precision(settings.matmul_precision)
-    with working_folder_importable():
+    with run.record.importable():
         callbacks = [instantiate(c) for c in (settings.callbacks or {}).values() if c]
+    quiet_lightning()
     unwanted: tuple[type, ...] = (ModelCheckpoint,)
     if not settings.trainer.get("enable_progress_bar", True):
         unwanted = (ModelCheckpoint, ProgressBar)

@@ -14,6 +14,7 @@ from dolens.experiments.camera.exportable import exportable
 from dolens.experiments.camera.network_export import FORMATS as NETWORK_FORMATS
 from dolens.experiments.camera.network_export import export_onnx, export_torch
 from dolens.experiments.running.finished_run import FinishedRun, load_run
+from dolens.experiments.running.trust import own_folder
 from dolens.manufacturing.design_files import design_hash
 from dolens.manufacturing.export_record import program_name, write_record
 from dolens.manufacturing.lens_export import FORMATS as LENS_FORMATS
@@ -37,6 +38,7 @@ class ExportSettings:
         size: rows and columns of the network's images; None: the sensor's.
         multiple: that sides are a multiple of; None: what is known of the network.
         tolerance_nm: the largest error in sag of the STEP file.
+        trust: whether the run may call, import and write what it names; see `load_run`.
     """
 
     formats: Sequence[str] = FORMATS
@@ -45,6 +47,7 @@ class ExportSettings:
     size: tuple[int, int] | None = None
     multiple: int | None = None
     tolerance_nm: float = TOLERANCE_NM
+    trust: bool = False
 
 
 def export_run(
@@ -70,8 +73,8 @@ def export_run(
     settings = settings or ExportSettings()
     for name in settings.formats:
         check_choice(name, FORMATS, "format")
-    loaded = load_run(run, settings.checkpoint)
-    folder = Path(folder) if folder is not None else loaded.folder / "export"
+    folder = Path(folder) if folder is not None else own_folder(run, "export")
+    loaded = load_run(run, settings.checkpoint, with_loss=False, trust=settings.trust)
     lens = copy.deepcopy(loaded.lens).double().cpu()
     design = design_hash(lens)
     drawn, tolerances = _tolerances(loaded, lens, settings.tolerances)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dolens.errors import InputError
 from dolens.experiments.comparison.run import Run, UnfinishedRun, read_run, read_unfinished
-from dolens.experiments.running.run_files import CONFIG, has_metrics
+from dolens.experiments.running.run_files import CONFIG, HYDRA, has_metrics
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,20 @@ def find_runs(folders: Iterable[Path], judge: str | None = None) -> FoundRuns:
         if not found:
             no_runs.append(f"{folder} is no run folder, and holds none (no .hydra/config.yaml)")
         places.update({path.resolve(): None for path in found})
-    shown = [_short(place) for place in places]
-    runs = tuple(read_run(place, judge) for place in shown if has_metrics(place))
-    others = (place for place in shown if not has_metrics(place))
-    unfinished = tuple(read_unfinished(place) for place in others)
+    runs: list[Run] = []
+    unfinished: list[UnfinishedRun] = []
+    for place in map(_short, places):
+        try:
+            if has_metrics(place):
+                runs.append(read_run(place, judge))
+            else:
+                unfinished.append(read_unfinished(place))
+        except InputError as error:  # a damaged record; the others are compared
+            unfinished.append(UnfinishedRun(place, "unreadable", str(error)))
     if not runs:
         failed = [f"{run.folder}: {run.status}: {run.reason}" for run in unfinished]
         raise InputError("no finished run: " + "; ".join((*no_runs, *failed)))
-    return FoundRuns(runs, unfinished, tuple(no_runs))
+    return FoundRuns(tuple(runs), tuple(unfinished), tuple(no_runs))
 
 
 def run_folders(folder: Path) -> list[Path]:
@@ -69,7 +75,7 @@ def run_folders(folder: Path) -> list[Path]:
 
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a run, finished or not."""
-    return (folder / CONFIG).is_file()
+    return (folder / CONFIG).exists() or (folder / HYDRA).exists()
 
 
 def _below(folder: Path) -> Iterable[Path]:

@@ -20,7 +20,9 @@ from dolens.experiments.running.run_files import (
     HYDRA,
     METRICS,
     RESOLVED,
+    JobRecord,
     info_of,
+    job_of,
     metrics_of,
     read_yaml,
 )
@@ -74,7 +76,7 @@ class UnfinishedRun:
 
     Attributes:
         folder: of the run.
-        status: `failed`, `interrupted`, `unfinished`, `pruned` or `repeated`.
+        status: `failed`, `interrupted`, `unfinished`, `pruned`, `repeated`, or `unreadable`.
         reason: the last error in its log, or what else is known.
     """
 
@@ -96,31 +98,35 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
         InputError: the run is not finished, or the folder is none of a run.
     """
     for name in (METRICS, HYDRA, CONFIG):
-        if not (folder / name).is_file():
+        if not (folder / name).exists():
             raise InputError(f"{folder} is no finished run folder: {name} is missing")
-    hydra = read_yaml(folder / HYDRA)["hydra"]
-    config = read_yaml(folder / CONFIG)
-    choices = hydra["runtime"]["choices"]
+    job = job_of(folder)
+    config = read_yaml(folder / CONFIG) or {}
     values = _resolved(folder, config)
     own = _settings(config, values)
-    if _continues(config, own, hydra):
+    if _continues(config, own, job):
         own.pop("ckpt_path")
-    metrics = _judged(metrics_of(folder), judge)
-    overrides = hydra.get("overrides", {}).get("task") or []
+    seed = values.get("seed", config.get("seed"))
+    if type(seed) is not int:
+        raise InputError(f"{folder / CONFIG} cannot be read (seed is {seed!r})")
+    try:
+        objectives = objective_names(values.get("objective", ""))
+    except InputError as error:
+        raise InputError(f"{folder / CONFIG} cannot be read ({error})") from None
     return Run(
         folder,
-        str(choices.get("experiment")),
-        int(values.get("seed", config["seed"])),
+        str(job.choices.get("experiment")),
+        seed,
         {
-            group: "null" if option is None else str(option)
-            for group, option in choices.items()
+            group: str(option or "null")
+            for group, option in job.choices.items()
             if group != "experiment" and not group.startswith("hydra/")
         },
         own,
         values,
-        tuple(override.lstrip("+~").partition("=")[0] for override in overrides),
-        objective_names(values.get("objective", "")),
-        metrics,
+        tuple(override.lstrip("+~").partition("=")[0] for override in job.overrides),
+        objectives,
+        _judged(metrics_of(folder), judge),
         read_scores(folder, f"test_{judge}" if judge else "test"),
         _code(folder),
     )
@@ -160,20 +166,26 @@ def _settings(config: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
     for name, leaf in flat(kept):
         # What the environment gives is a setting of this run, whatever is written.
         outside = isinstance(leaf, str) and "${oc.env:" in leaf
-        value = values.get(name, leaf) if outside else leaf
-        found[name] = json.dumps(value, sort_keys=True, default=str)
+        found[name] = json.dumps(_with_text_keys(values.get(name, leaf) if outside else leaf))
     if config.get("ckpt_path") is None:
         found.pop("ckpt_path", None)  # a run of before may not have the key at all
     return found
 
 
-def _continues(config: Mapping[str, Any], own: Mapping[str, str], hydra: Mapping[str, Any]) -> bool:
+def _with_text_keys(leaf: Any) -> Any:
+    """Return a value in which mappings are in the order of their keys, whatever kind these are."""
+    if isinstance(leaf, dict):
+        pairs = sorted((str(key), value) for key, value in leaf.items())
+        return {key: _with_text_keys(value) for key, value in pairs}
+    return list(map(_with_text_keys, leaf)) if isinstance(leaf, list) else leaf
+
+
+def _continues(config: Mapping[str, Any], own: Mapping[str, str], job: JobRecord) -> bool:
     """Return whether a run trained on from the checkpoint of a run with the same settings."""
     path = config.get("ckpt_path")
     if not isinstance(path, str) or not config.get("train", True):
         return False
-    started_in = Path(hydra["runtime"].get("cwd", "."))
-    before = read_yaml((started_in / path).resolve().parent.parent / CONFIG)
+    before = read_yaml((Path(job.cwd) / path).resolve().parent.parent / CONFIG)
     if before is None:
         return False
     mine = {key: value for key, value in own.items() if key != "ckpt_path"}
@@ -187,14 +199,15 @@ def _resolved(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     if resolved is not None:
         return dict(flat(resolved))
     register_resolvers()
-    cfg = OmegaConf.create(dict(config))
-    found = {}
-    for name, leaf in flat(dict(config)):
-        try:
-            value = OmegaConf.select(cfg, name) if isinstance(leaf, str) else leaf
-            found[name] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        except OmegaConfBaseException:
-            found[name] = leaf
+    found = dict(flat(dict(config)))
+    for name, leaf in found.items():
+        # What a stranger's run asks of this environment is left as it is written.
+        if isinstance(leaf, str) and "${" in leaf and "oc.env" not in leaf:
+            try:
+                value = OmegaConf.select(OmegaConf.create(dict(config)), name)
+                found[name] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+            except OmegaConfBaseException:
+                continue
     return found
 
 

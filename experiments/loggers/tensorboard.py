@@ -1,13 +1,11 @@
 """TensorBoard: curves, pictures, and a table of runs that has what was swept."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
-from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from dolens.experiments.loggers.failures import ends_alone
@@ -16,10 +14,7 @@ from dolens.experiments.loggers.protocol import RunSummary
 
 @ends_alone
 class TensorBoard(TensorBoardLogger):
-    """Writes event files for TensorBoard.
-
-    The table of the HPARAMS tab is made of the folders `summary`, a run of its own to TensorBoard:
-    it has few columns, of which TensorBoard shows those first that differ among the runs.
+    """Writes event files for TensorBoard, into one folder: each is a run of its own to TensorBoard.
 
     Args:
         save_dir: the folder of the event files.
@@ -46,10 +41,11 @@ class TensorBoard(TensorBoardLogger):
         self.log_metrics(dict(summary.numbers), step=summary.step)
         settings = yaml.safe_dump(dict(summary.settings), sort_keys=False, allow_unicode=True)
         self.experiment.add_text("settings", f"```yaml\n{settings}```", summary.step)
-        self.experiment.flush()
+        if summary.objective in summary.numbers:
+            # TensorBoard sorts the columns by name: a capital letter comes before the others.
+            objective = summary.numbers[summary.objective]
+            self.experiment.add_scalar("Objective", objective, summary.step)
         _, start, end = hparams(dict(summary.choices), {})
-        with SummaryWriter(str(Path(self.log_dir) / "summary")) as writer:
-            for part in (start, end):
-                writer.file_writer.add_summary(part)
-            for name, number in summary.headline_numbers().items():
-                writer.add_scalar(name, number, summary.step)
+        for part in (start, end):
+            self.experiment.file_writer.add_summary(part)
+        self.experiment.flush()

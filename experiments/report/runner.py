@@ -43,7 +43,7 @@ def system_command(system: System, folder: Path) -> list[str]:
     """Return the command that runs a system into a folder, from a checkout or a wheel alike."""
     if system.module is not None:
         return [sys.executable, "-m", system.module, str(folder)]
-    train = [sys.executable, "-m", "dolens.cli", "train"]
+    train = [sys.executable, "-m", "dolens", "train"]
     return [*train, *system.overrides, f"hydra.run.dir={folder}"]
 
 

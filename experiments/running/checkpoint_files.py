@@ -15,6 +15,17 @@ from dolens.whole_files import written_whole
 
 # So much of a foreign program's reason is repeated.
 _REASON = 200
+# What a checkpoint may have of Lightning's, and of which kind it is.
+_KINDS: Mapping[str, type] = {
+    "state_dict": dict,
+    "global_step": int,
+    "epoch": int,
+    "optimizer_states": list,
+    "lr_schedulers": list,
+    "loops": dict,
+    "callbacks": dict,
+    "pytorch-lightning_version": str,
+}
 _GLOBAL = re.compile(r"GLOBAL (\S+)")
 
 
@@ -87,7 +98,19 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
         )
     if not isinstance(found, Mapping) or "state_dict" not in found:
         raise InputError(f"{where}{path} holds no state of a module")
+    for key, kind in _KINDS.items():
+        value = found.get(key, kind())
+        negative = isinstance(value, int) and (isinstance(value, bool) or value < 0)
+        if not isinstance(value, kind) or negative:
+            raise InputError(f"{where}{path} is damaged: its {key} is {_shown(value)}")
+    for name, value in found["state_dict"].items():
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
+            raise InputError(f"{where}{path} is damaged: its {name} is {_shown(value)}")
     return found
+
+
+def _shown(value: Any) -> str:
+    return one_line(f"{type(value).__name__} {value!r}")[:_REASON]
 
 
 def _reason(error: Exception) -> str:

@@ -7,11 +7,11 @@ from typing import Any
 
 import lightning
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, refuse_another
 from dolens.experiments.running.checkpoint_files import read_checkpoint
+from dolens.experiments.running.checkpoint_state import misfit
 from dolens.experiments.running.plain_values import flat
 
 logger = logging.getLogger(__name__)
@@ -81,7 +81,16 @@ def checked_checkpoint(
         )
     else:
         _compare(written, settings, training)
-    _refuse_other_shapes(checkpoint["state_dict"], module.state_dict())
+    most, epoch = settings.get("trainer.max_epochs"), checkpoint.get("epoch", 0)
+    if training and isinstance(most, int) and 0 <= most <= epoch:
+        raise InputError(
+            f"trainer.max_epochs: {most}; the checkpoint is of epoch {epoch + 1}; allowed: "
+            f"{epoch + 1}, or more to go on training"
+        )
+    logger.info("Going on from %s, after %d steps", path, checkpoint.get("global_step", 0))
+    reason = misfit(checkpoint["state_dict"], module.state_dict())
+    if reason:
+        raise InputError(f"ckpt_path: {reason}; resume with the settings that wrote it")
     return path
 
 
@@ -99,22 +108,18 @@ def _compare(written: Mapping[str, Any], own: Mapping[str, Any], training: bool)
             "ckpt_path: the checkpoint is of another lens, whose state it would put in the place "
             f"of this one: {'; '.join(differences[n] for n in fixed[:_NAMED])}{more}"
         )
+    kinds = [n for n in differences if n in ("scheduler", "scheduler._target_")]
+    if training and kinds:
+        raise InputError(
+            f"ckpt_path: {differences[kinds[0]]}; a schedule goes on as one of its kind"
+        )
     if differences:
         logger.warning(
-            "ckpt_path: this run differs from the one that wrote the checkpoint: %s. Weights, "
-            "learning rates and schedules that the checkpoint holds go on as they were",
+            "ckpt_path: this run differs from the one that wrote the checkpoint: %s. Weights and "
+            "learning rates that the checkpoint holds go on as they were; schedules are this run's",
             "; ".join(differences.values()),
         )
 
 
 def _shown(settings: Mapping[str, Any], name: str) -> str:
     return repr(settings[name]) if name in settings else "not set"
-
-
-def _refuse_other_shapes(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    for name, value in own.items():
-        if name in found and found[name].shape != value.shape:
-            raise InputError(
-                f"ckpt_path: {name} has shape {tuple(found[name].shape)} in the checkpoint and "
-                f"{tuple(value.shape)} in this run; resume with the settings that wrote it"
-            )

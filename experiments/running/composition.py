@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -12,11 +13,13 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.catalogue import configuration_folders
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.dropped_entries import without_dropped
 from dolens.experiments.running.recorded_run import RecordedRun
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 from dolens.packaged import packaged_configuration
 
 # The keys that lead to a value; keys may contain dots, so that a text would not do.
@@ -41,7 +44,8 @@ def with_overrides(record: RecordedRun, overrides: Sequence[str]) -> dict[str, A
         Plain values without interpolations.
 
     Raises:
-        InputError: the configuration cannot be composed, or an override is refused; see `checked`.
+        InputError: the configuration cannot be composed, an override is refused (see `checked`), or
+            the run needs trust.
     """
     if not overrides:
         return dict(record.config)
@@ -49,6 +53,10 @@ def with_overrides(record: RecordedRun, overrides: Sequence[str]) -> dict[str, A
     with _composed(record, record.overrides) as cfg:
         before = _resolved(without_dropped(OmegaConf.masked_copy(cfg, _but_hydra(cfg))))
     with _composed(record, [*record.overrides, *overrides]) as cfg:
+        if not record.trusted:  # before anything looks at the classes that are named
+            own = OmegaConf.masked_copy(cfg, _but_hydra(cfg))
+            plain = OmegaConf.to_container(own, resolve=False)
+            refuse_untrusted(needing_trust(plain), record.folder)
         after = _resolved(checked(cfg))
     return _with_differences(record.config, before, after)
 
@@ -63,10 +71,15 @@ def changed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[
 def _composed(record: RecordedRun, overrides: Sequence[str]) -> Iterator[DictConfig]:
     """Compose as a run of train.py does; within the context HydraConfig is that of the job."""
     folders = [path for path in record.sources if path.is_dir()]
+    own = [folder.resolve() for folder in configuration_folders(Path.cwd())]
+    strangers = [path for path in folders if path.resolve() not in own]
+    if strangers and not record.trusted:
+        refuse_untrusted([f"be composed of {strangers[0]}"], record.folder)
     main = next((path for path in folders if (path / f"{_MAIN}.yaml").is_file()), None)
     main = main or packaged_configuration()
     others = [f"file://{path}" for path in folders if path != main]
-    path = [f"hydra.searchpath=[{','.join(others)}]"] if others else []
+    # Whatever the main file itself says of it: a package that it names would be imported.
+    path = [f"hydra.searchpath=[{','.join(others)}]"]
     hydra, job = GlobalHydra.instance().hydra, HydraConfig.instance().cfg
     GlobalHydra.instance().clear()
     try:

@@ -1,10 +1,7 @@
 """A run folder loaded again as objects: the trained module, its lens and its data."""
 
 import copy
-import logging
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +12,9 @@ import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.running.checkpoint_files import read_checkpoint
 from dolens.experiments.running.checkpoint_state import CHECKPOINTS, checkpoint_file, take_up
@@ -25,12 +23,13 @@ from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.perturbed_lens import perturbed_state
 from dolens.experiments.running.recorded_run import RecordedRun, read_record
 from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.run_files import RESOLVED
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.target_keys import refuse_unknown_keys
+from dolens.experiments.running.trust import needing_trust, refuse_untrusted
+from dolens.experiments.running.value_types import refuse_wrong_types
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class FinishedRun:
         Raises:
             InputError: it cannot be made.
         """
-        with working_folder_importable():
+        with self.record.importable():
             return _made("data", self.settings.data)
 
 
@@ -92,16 +91,18 @@ def load_run(
     overrides: Sequence[str] = (),
     output: str | Path | None = None,
     with_loss: bool = True,
+    trust: bool = False,
 ) -> FinishedRun:
     """Load a run folder as objects, in the state of a checkpoint.
 
     Parameters of the lens are those of the checkpoint, except where an override sets one to another
     value; whether overrides make another camera besides is not looked at here.
 
-    The folder says which classes are made, a user's own among them, which are looked for in the
-    working folder and where Python looks: load only runs that you trust.  The checkpoint is read as
-    plain tensors and values.  Neither Hydra's job nor global state is needed or changed, except
-    that the modules of `extensions` are imported; random numbers are left as they were.
+    The folder says which classes are made.  They are those of dolens, torch and Lightning, unless
+    the run is trusted: a user's own ones are then looked for in the working folder and where Python
+    looks, and the modules of `extensions` are imported.  The checkpoint is read as plain tensors
+    and values.  Neither Hydra's job nor other global state is needed or changed; random numbers are
+    left as they were.
 
     Args:
         folder: of the run.
@@ -109,13 +110,14 @@ def load_run(
         overrides: as of the command line, applied over the run's own; see `with_overrides`.
         output: where paths of the configuration within the run folder lead to; None: the folder.
         with_loss: whether the loss is needed: a perceptual one looks for a classifier's weights.
+        trust: whether the folder may call, import and write what it names; see `needing_trust`.
 
     Raises:
-        InputError: the folder is none of a run; it has no such checkpoint; a class is not there; or
-            the checkpoint is of another experiment, lens or network.
+        InputError: the folder is none of a run, or needs trust; it has no such checkpoint; a class
+            is not there; or the checkpoint is of another experiment, lens or network.
     """
-    record = read_record(folder, output)
-    with working_folder_importable():
+    record = read_record(folder, output, trust)
+    with record.importable():
         config = with_overrides(record, overrides)
     return load_recorded(record, config, checkpoint, with_loss)
 
@@ -138,7 +140,9 @@ def load_recorded(
         InputError: as of `load_run`.
     """
     register_resolvers()
-    with working_folder_importable():
+    if not record.trusted:
+        refuse_untrusted(needing_trust(config, record.output), record.folder)
+    with record.importable():
         return _loaded(record, config, checkpoint, with_loss)
 
 
@@ -170,18 +174,18 @@ def _loaded(
 ) -> FinishedRun:
     import_extensions(config.get("extensions"))
     try:
+        cfg = OmegaConf.create(dict(config))
+        settings = RunSettings.of(cfg)
         refuse_unknown_keys(config, ("module",))
-    except InputError as error:
-        raise InputError(
-            f"{record.folder}: {error}; Python looks for classes in the working folder, "
-            f"{Path.cwd()}, and in those of PYTHONPATH"
-        ) from None
-    cfg = OmegaConf.create(dict(config))
-    settings = RunSettings.of(cfg)
-    made_of = OmegaConf.create(_without_first_weights(config["module"], with_loss))
-    with torch.random.fork_rng(devices=()):
-        module = _made("module", made_of)(lens=_lens(settings.prescription(), settings))
-    check_experiment(module, train=False)
+        refuse_wrong_types(config, ("module", "data", "callbacks", "trainer"))
+        made_of = OmegaConf.create(_without_first_weights(config["module"], with_loss))
+        with torch.random.fork_rng(devices=()):
+            module = _module(made_of, _lens(settings.prescription(), settings))
+        check_experiment(module, train=False)
+    except (InputError, OmegaConfBaseException) as error:
+        where = f"; Python looks for classes in {Path.cwd()} and in the folders of PYTHONPATH"
+        message = f"{record.folder / RESOLVED}: {one_line(error)}"
+        raise InputError(message + where * record.trusted) from None
     file, state = None, {}
     if module.trains:
         file = checkpoint_file(record, checkpoint)
@@ -208,6 +212,20 @@ def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
     return lens.in_state(settings.state)
 
 
+def _module(config: DictConfig, lens: Lens) -> Experiment:
+    make = _made("module", config)
+    if not callable(make):
+        raise InputError(
+            "module: makes no experiment of a lens; allowed: _target_, _partial_: true"
+        )
+    try:
+        return make(lens=lens)
+    except InputError:
+        raise
+    except Exception as error:  # as Hydra's, of what it makes itself
+        raise InputError(f"module: {type(error).__name__}: {one_line(error)}") from error
+
+
 def _made(key: str, config: DictConfig) -> Any:
     """Return what a part of the configuration makes.
 
@@ -220,15 +238,3 @@ def _made(key: str, config: DictConfig) -> Any:
         if isinstance(error.__cause__, InputError):
             raise error.__cause__ from None
         raise InputError(f"{key}: {' '.join(str(error).split())}") from error
-
-
-@contextmanager
-def working_folder_importable() -> Iterator[None]:
-    """Let Python find a user's own modules in the working folder, as `python train.py` does."""
-    before, folder = list(sys.path), str(Path.cwd())
-    if folder not in sys.path and "" not in sys.path:
-        sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        sys.path[:] = before

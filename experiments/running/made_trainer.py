@@ -1,5 +1,7 @@
 """Lightning's trainer is made of its settings, with what several processes need."""
 
+import logging
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,6 +33,23 @@ class SharedBatchStatistics(LayerSync):
         return own_batch_statistics(model)
 
 
+# What Lightning brings about in every run, and in every run that is resumed in a folder of its own.
+_OF_EVERY_RUN = (
+    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
+    "The dirpath has changed from",
+)
+
+
+def quiet_lightning() -> None:
+    """Let Lightning say nothing but warnings, and none of its own doing.
+
+    The rest is advertisements, and what a run says by itself.
+    """
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for message in _OF_EVERY_RUN:
+        warnings.filterwarnings("ignore", message)
+
+
 def made_trainer(
     settings: DictConfig, callbacks: Sequence[lightning.Callback], loggers: Sequence[Any]
 ) -> lightning.Trainer:
@@ -45,6 +64,7 @@ def made_trainer(
         InputError: a strategy, a precision, a number of processes or of accumulated batches that
             cannot be.
     """
+    quiet_lightning()
     strategy = settings.get("strategy", "auto")
     if isinstance(strategy, str):
         check_choice(strategy, _STRATEGIES, "trainer.strategy")

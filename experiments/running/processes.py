@@ -5,6 +5,7 @@ the system's temporary ones, which goes with them.  Where others start all proce
 and Slurm do, nothing is started here.
 """
 
+import json
 import logging
 import os
 import signal
@@ -25,7 +26,7 @@ import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.run_files import read_json, write_json
+from dolens.experiments.running.run_files import write_json
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +120,7 @@ def _started(trainer: lightning.Trainer, threads: int | None) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="dolens-reports-") as folder:
         added[_REPORTS] = folder
         os.environ.update(added, LOCAL_RANK="0")
-        command = [sys.executable, "-m", "dolens.cli", "train", *sys.argv[1:]]
+        command = [sys.executable, "-m", "dolens", "train", *sys.argv[1:]]
         started = [
             subprocess.Popen(command, env={**os.environ, "LOCAL_RANK": str(rank)})
             for rank in range(1, count)
@@ -170,7 +171,7 @@ class _Started:
         for number in self.failed():
             path = self.folder / f"{number}.json"
             if path.is_file():
-                report = read_json(path)
+                report = json.loads(path.read_text(encoding="utf-8"))
                 if not report["lost"]:
                     if report["trace"]:
                         logger.error("process %d: %s", number, report["trace"])

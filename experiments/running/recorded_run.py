@@ -1,19 +1,31 @@
 """What a run folder says of its run: the settings, the overrides, the versions, how it ended."""
 
-import json
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.plain_values import walk
 from dolens.experiments.running.renaming import translated, with_targets_of_now
-from dolens.experiments.running.run_files import HYDRA, INFO, OVERRIDES, RESOLVED
+from dolens.experiments.running.run_files import (
+    HYDRA,
+    INFO,
+    OVERRIDES,
+    RESOLVED,
+    info_of,
+    job_of,
+    overrides_of,
+    read_yaml,
+)
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 
 _RECORDS = (RESOLVED, HYDRA, OVERRIDES, INFO)
 
@@ -32,6 +44,7 @@ class RecordedRun:
         sources: folders of the configuration that the run was composed from, the main one first.
         info: run.json.
         output: the folder that the configuration's paths lead to.
+        trusted: whether the run may have called what it names, whatever that is.
     """
 
     folder: Path
@@ -42,6 +55,7 @@ class RecordedRun:
     sources: tuple[Path, ...]
     info: Mapping[str, Any]
     output: Path
+    trusted: bool
 
     @property
     def status(self) -> str:
@@ -53,8 +67,21 @@ class RecordedRun:
         """The name of the experiment."""
         return str(self.choices.get("experiment"))
 
+    @contextmanager
+    def importable(self) -> Iterator[None]:
+        """Let Python find a user's own modules in the working folder, if the run is trusted."""
+        before, folder = list(sys.path), str(Path.cwd())
+        if self.trusted and folder not in sys.path and "" not in sys.path:
+            sys.path.insert(0, folder)
+        try:
+            yield
+        finally:
+            sys.path[:] = before
 
-def read_record(folder: str | Path, output: str | Path | None = None) -> RecordedRun:
+
+def read_record(
+    folder: str | Path, output: str | Path | None = None, trust: bool = False
+) -> RecordedRun:
     """Read the record of a run folder.
 
     The folder may have been moved since the run: paths of the configuration that lay within it
@@ -63,37 +90,42 @@ def read_record(folder: str | Path, output: str | Path | None = None) -> Recorde
     Args:
         folder: of the run.
         output: where such paths are to lead instead; None: the folder itself.
+        trust: whether the run may call, import and write what it names; see `needing_trust`.
 
     Raises:
-        InputError: the folder is none of a run, or its record cannot be read.
+        InputError: the folder is none of a run, its record cannot be read, or it needs trust.
     """
     folder = Path(folder).expanduser().resolve()
     _check_folder(folder)
     output = folder if output is None else Path(output).expanduser().resolve()
-    config = _mapping(folder / RESOLVED)
-    job = _mapping(folder / HYDRA)
+    job = job_of(folder)
+    config = read_yaml(folder / RESOLVED) or {}
+    for path, value, _ in walk("", config):
+        if isinstance(value, str) and "${" in value:
+            raise InputError(f"{folder / RESOLVED}: {path} is '{value}', and not resolved")
+    if not job.output_dir or not job.sources:
+        raise InputError(f"{folder / HYDRA} is not that of a run")
     try:
-        runtime = job["hydra"]["runtime"]
-        choices, written_to = dict(runtime["choices"]), str(runtime["output_dir"])
-        searched = [source for source in runtime["config_sources"] if source["schema"] == "file"]
-        sources = tuple(Path(source["path"]) for source in searched)
-    except (KeyError, TypeError):
-        raise InputError(f"{folder}: .hydra/hydra.yaml is not that of a run") from None
-    overrides = _read(folder / OVERRIDES) or []
+        RunSettings.of(OmegaConf.create(config))
+    except (InputError, OmegaConfBaseException) as error:
+        raise InputError(f"{folder / RESOLVED}: {one_line(error)}") from None
     try:
-        now, notes = translated([str(override) for override in overrides])
+        now, notes = translated(overrides_of(folder))
     except HydraException as error:
-        reason = one_line(error)
-        raise InputError(f"{folder}: .hydra/overrides.yaml cannot be read ({reason})") from None
+        raise InputError(f"{folder / OVERRIDES} cannot be read ({one_line(error)})") from None
+    config = with_targets_of_now(_moved(config, job.output_dir, str(output)))
+    if not trust:
+        refuse_untrusted(needing_trust(config, output), folder)
     return RecordedRun(
         folder,
-        with_targets_of_now(_moved(config, written_to, str(output))),
+        config,
         tuple(now),
         tuple(notes),
-        choices,
-        sources,
-        _mapping(folder / INFO),
+        job.choices,
+        job.sources,
+        info_of(folder),
         output,
+        trust,
     )
 
 
@@ -101,7 +133,7 @@ def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         state = "is no folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder}: {state}; name the folder of a run, as outputs/<name>/<date>")
-    missing = [name for name in _RECORDS if not (folder / name).is_file()]
+    missing = [name for name in _RECORDS if not (folder / name).exists()]
     if not missing:
         return
     inner = sorted(p.parent.name for p in folder.glob("*/run.json"))
@@ -111,23 +143,6 @@ def _check_folder(folder: Path) -> None:
             f"{folder / inner[0]}"
         )
     raise InputError(f"{folder} is no run folder: {missing[0]} is missing")
-
-
-def _read(file: Path) -> Any:
-    try:
-        if file.suffix == ".json":
-            return json.loads(file.read_text(encoding="utf-8"))
-        # As Hydra reads it: 1e-5 is a number.
-        return OmegaConf.to_container(OmegaConf.load(file), resolve=False)
-    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise InputError(f"{file} cannot be read ({' '.join(str(error).split())})") from None
-
-
-def _mapping(file: Path) -> dict[str, Any]:
-    found = _read(file)
-    if not isinstance(found, dict):
-        raise InputError(f"{file} cannot be read (it holds no mapping)")
-    return found
 
 
 def _moved(node: Any, old: str, new: str) -> Any:

@@ -67,6 +67,11 @@ class RunSettings:
     state: str | None = None
 
     def __post_init__(self) -> None:
+        for key in ("module", "data", "trainer"):
+            _check_mapping(key, getattr(self, key))
+        for key in ("callbacks", "logger", "lens"):
+            if getattr(self, key) is not None:
+                _check_mapping(key, getattr(self, key))
         check_choice(self.lens_dtype, DTYPES, "lens_dtype")
         check_choice(self.matmul_precision, _PRECISIONS, "matmul_precision")
         for key in ("train", "test"):
@@ -121,6 +126,11 @@ class RunSettings:
         if self.lens is None:
             raise InputError("lens: is missing from the configuration")
         return OmegaConf.to_container(self.lens, resolve=True)
+
+
+def _check_mapping(key: str, value: Any) -> None:
+    if not isinstance(value, DictConfig):
+        raise InputError(f"{key}: {value!r}; allowed: settings, as a mapping")
 
 
 def _check_type(key: str, value: Any, kind: type, allowed: str) -> None:

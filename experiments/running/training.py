@@ -19,7 +19,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
-from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
+from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs, ResumedSchedules
 from dolens.experiments.callbacks.starvation import StarvationWarning
 from dolens.experiments.checks import check_sensor_distance
 from dolens.experiments.experiment import Experiment, check_experiment
@@ -96,7 +96,9 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     if not settings.trainer.get("enable_progress_bar", True):
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
+    epochs = ResumedEpochs()
+    callbacks += [epochs, ResumedSchedules(), LogsBeforeCheckpoints()]
+    callbacks.append(SettingsInCheckpoints(written))
     starvation = StarvationWarning()
     callbacks += [starvation, LoggedObjectives(settings.objectives), *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
@@ -119,6 +121,8 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
         with all_processes(trainer, settings.threads):
             if settings.train:
                 trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
+                if not epochs.trained and any(n.startswith("val/") for n in settings.objectives):
+                    trainer.validate(module, data, verbose=False)
             metrics: dict[str, Any] = dict(trainer.callback_metrics)
             if settings.test:
                 # The weights as the last step left them: every run is judged after the same work.

@@ -12,9 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from dolens.errors import InputError, one_line
+from dolens.errors import InputError
 from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.run_files import (
     CONFIG,
@@ -24,6 +22,7 @@ from dolens.experiments.running.run_files import (
     metrics_of,
     read_yaml,
 )
+from dolens.prescriptions.yaml_text import plain_values
 
 logger = logging.getLogger(__name__)
 
@@ -48,14 +47,10 @@ def refuse_other_settings(folder: Path, settings: str) -> None:
     """
     if not (folder / INFO).is_file():
         return  # no run got so far as to compute anything
-    try:
-        written = read_yaml(folder / CONFIG)
-    except yaml.YAMLError as error:
-        raise InputError(f"{folder / CONFIG} is no YAML file: {one_line(error)}") from None
-    written = dict(written or {})
+    written = read_yaml(folder / CONFIG) or {}
     if written.get("ckpt_path") == str(folder / _LAST):
         written["ckpt_path"] = None  # the run was stopped before, and had gone on
-    differences = _differences(_plain(written), _plain(yaml.safe_load(settings)))
+    differences = _differences(_plain(written), _plain(plain_values(settings, "the job")))
     if differences:
         more = f" and {len(differences) - _NAMED} more" if len(differences) > _NAMED else ""
         raise InputError(

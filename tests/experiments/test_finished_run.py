@@ -132,12 +132,13 @@ def test_a_class_of_one_s_own_is_looked_for_in_the_working_folder(copy, tmp_path
     own = "loss_of_a_user.Own"
     file.write_text(file.read_text().replace("dolens.reconstruction.RestorationLoss", own))
     assert own in file.read_text()
-    assert f"'{own}' cannot be found" in refusal(copy)
+    assert f"would call {own} (loss)" in refusal(copy)
+    assert f"'{own}' cannot be found" in refusal(copy, trust=True)
     (tmp_path / "loss_of_a_user.py").write_text(
         "import dolens.reconstruction\nOwn = dolens.reconstruction.RestorationLoss\n"
     )
     monkeypatch.chdir(tmp_path)
-    assert load_run(copy).step == 2
+    assert load_run(copy, trust=True).step == 2
 
 
 def test_overrides_that_cannot_be_applied_are_refused(tiny_run):

@@ -47,8 +47,9 @@ def test_a_default_loader_shows_every_point_of_a_camera(composed, tmp_path):
 def test_the_table_of_runs_has_what_was_chosen_and_the_objective_first(composed, tmp_path):
     given = ("lens.surfaces.1.radius=25.1", "trainer.max_epochs=1", "data.scale_range=[1.0,1.5]")
     run(composed(*TINY_CAMERA, *UNTESTED, *given, "network.width=6"))
-    summary = EventAccumulator(str(tmp_path / "run" / "tensorboard" / "summary"))
-    summary.Reload()
+    files = (tmp_path / "run" / "tensorboard").rglob("events.*")
+    assert len({file.parent for file in files}) == 1  # each folder is a run to TensorBoard
+    summary = loaded(tmp_path / "run")
     found = summary.PluginTagToContent("hparams")
     # A list of columns of this run would be taken for that of all runs.
     assert set(found) == {"_hparams_/session_start_info", "_hparams_/session_end_info"}
@@ -64,8 +65,7 @@ def test_the_table_of_runs_has_what_was_chosen_and_the_objective_first(composed,
     assert not [name for name in columns if name.startswith(("callbacks", "logger", "hydra"))]
     assert len(columns) < 50
     # TensorBoard sorts the numbers by name: a capital letter comes before all others.
-    numbers = sorted(summary.Tags()["scalars"])
-    assert numbers[0] == "Objective" and len(numbers) < 15
+    assert sorted(summary.Tags()["scalars"])[0] == "Objective"
 
 
 def test_the_text_of_a_run_has_all_its_settings(composed, tmp_path):

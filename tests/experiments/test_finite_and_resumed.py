@@ -4,12 +4,13 @@ import lightning
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
+from torch.optim import lr_scheduler as schedules
 from torch.utils.data import DataLoader, TensorDataset
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.finite_training import FiniteTraining
 from dolens.experiments.callbacks.last_checkpoint import LastCheckpoint
-from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
+from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs, ResumedSchedules
 
 NAN = float("nan")
 
@@ -171,3 +172,94 @@ def test_the_validation_of_an_epoch_is_not_left_out(tmp_path):
         Line(), tmp_path / "b", ResumedEpochs(), checkpoint=tmp_path / "a" / "step=2.ckpt", epochs=1
     )
     assert again.validated == [0, 0, 0]
+
+
+# Schedules by their length in steps, over nine steps where they are not cut short.
+SCHEDULES = {
+    "cosine": lambda o, n: schedules.CosineAnnealingLR(o, n),
+    "linear": lambda o, n: schedules.LinearLR(o, 1.0, 0.1, n),
+    "constant": lambda o, n: schedules.ConstantLR(o, 0.5, n - 2),
+    "polynomial": lambda o, n: schedules.PolynomialLR(o, n, 2.0),
+    "one cycle": lambda o, n: schedules.OneCycleLR(o, 0.2, n),
+    "restarts": lambda o, n: schedules.CosineAnnealingWarmRestarts(o, n),
+    "steps": lambda o, n: schedules.StepLR(o, n // 3),
+    "milestones": lambda o, n: schedules.MultiStepLR(o, [n // 3, n - 2]),
+    "exponential": lambda o, n: schedules.ExponentialLR(o, 0.1 ** (1 / n)),
+    "cyclic": lambda o, n: schedules.CyclicLR(o, 0.01, 0.1, n // 3, cycle_momentum=False),
+    "function": lambda o, n: schedules.LambdaLR(o, lambda step: 1.0 - step / n),
+    "factors": lambda o, n: schedules.MultiplicativeLR(o, lambda step: 1.0 - 1.0 / n),
+    "one behind the other": lambda o, n: schedules.SequentialLR(
+        o,
+        [schedules.LinearLR(o, 0.1, 1.0, n // 3), schedules.CosineAnnealingLR(o, n - n // 3)],
+        [n // 3],
+    ),
+    "one times the other": lambda o, n: schedules.ChainedScheduler(
+        [schedules.LinearLR(o, 1.0, 0.1, n), schedules.ExponentialLR(o, 0.9)]
+    ),
+}
+
+
+class Scheduled(Line):
+    """A line whose learning rate follows a schedule by the step; it keeps the rates."""
+
+    def __init__(self, schedule, steps, rate=0.1):
+        super().__init__()
+        self.schedule, self.length, self.rate, self.rates = schedule, steps, rate, []
+
+    def configure_optimizers(self):
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate)
+        schedule = SCHEDULES[self.schedule](optimizer, self.length)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+        }
+
+    def on_train_batch_start(self, batch, batch_idx):
+        self.rates.append(self.optimizers().param_groups[0]["lr"])
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_a_run_resumed_with_more_epochs_follows_their_schedule(tmp_path, schedule):
+    """As one that had them from the start does at the same steps."""
+    kept = [every_step(tmp_path), ResumedEpochs(), ResumedSchedules()]
+    whole = fit(Scheduled(schedule, 9), tmp_path / "whole", epochs=3)
+    fit(Scheduled(schedule, 6), tmp_path, *kept)
+    last = tmp_path / "step=6.ckpt"
+    more = fit(Scheduled(schedule, 9), tmp_path / "more", *kept[1:], checkpoint=last, epochs=3)
+    assert more.rates == pytest.approx(whole.rates[6:], rel=1e-12)
+    (of_whole,), (of_more,) = whole.trainer.lr_scheduler_configs, more.trainer.lr_scheduler_configs
+    assert of_more.scheduler.get_last_lr() == pytest.approx(of_whole.scheduler.get_last_lr())
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_a_run_resumed_with_the_same_epochs_is_the_same_to_the_bit(tmp_path, schedule):
+    kept = [every_step(tmp_path), ResumedEpochs(), ResumedSchedules()]
+    whole = fit(Scheduled(schedule, 6), tmp_path, *kept)
+    for step in (1, 2, 4, 5):
+        folder, middle = tmp_path / str(step), tmp_path / f"step={step}.ckpt"
+        again = fit(Scheduled(schedule, 6), folder, *kept[1:], checkpoint=middle)
+        assert again.rates == whole.rates[step:] and torch.equal(again.weight, whole.weight)
+
+
+def test_a_resumed_run_keeps_the_learning_rate_that_it_had(tmp_path):
+    kept = [every_step(tmp_path), ResumedSchedules()]
+    fit(Scheduled("cosine", 6), tmp_path, *kept)
+    whole = fit(Scheduled("cosine", 9), tmp_path / "whole", epochs=3)
+    more = Scheduled("cosine", 9, rate=0.7)
+    fit(more, tmp_path / "more", kept[1], checkpoint=tmp_path / "step=6.ckpt", epochs=3)
+    assert more.rates == pytest.approx(whole.rates[6:], rel=1e-12)
+
+
+def test_a_schedule_that_is_over_before_the_checkpoint_is_named(tmp_path):
+    fit(Scheduled("one cycle", 6), tmp_path, every_step(tmp_path))
+    with pytest.raises(InputError, match="ckpt_path: scheduler: Tried to step 4 times"):
+        short, last = Scheduled("one cycle", 3), tmp_path / "step=6.ckpt"
+        fit(short, tmp_path / "more", ResumedSchedules(), checkpoint=last, epochs=3)
+
+
+def test_a_run_that_has_nothing_left_to_train_keeps_the_checkpoint(tmp_path, caplog):
+    fit(Line(), tmp_path, every_step(tmp_path))
+    last = LastCheckpoint(tmp_path / "more", filename="last")
+    fit(Line(), tmp_path / "more", last, checkpoint=tmp_path / "step=6.ckpt")
+    assert (tmp_path / "more/last.ckpt").read_bytes() == (tmp_path / "step=6.ckpt").read_bytes()
+    assert "nothing is left to train" in caplog.text

@@ -116,7 +116,7 @@ def test_the_wheel_holds_every_file_of_the_library_the_experiments_and_the_confi
 def test_a_user_s_experiment_lens_and_surfaces_run_with_the_wheel(installed, root, tmp_path):
     write_own(tmp_path, root)
     done = subprocess.run(
-        [sys.executable, "-m", "dolens.cli", "train", "experiment=mine", *SHORT],
+        [sys.executable, "-m", "dolens", "train", "experiment=mine", *SHORT],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"},
         capture_output=True,
