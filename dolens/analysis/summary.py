@@ -12,7 +12,7 @@ from dolens.analysis.first_order_numbers import FirstOrderNumbers, first_order_n
 from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.optics.fields import point_text
+from dolens.optics.fields import point_text, weights_text
 from dolens.optics.lens import Lens
 from dolens.optics.tables import html_table, printable, text_table
 
@@ -29,7 +29,8 @@ class FieldSummary:
             does not arrive.
         rms_spot_um: µm, RMS radius of all wavelengths together about their centroid; NaN where no
             light passes.
-        geo_spot_um: µm, the largest distance of a ray from its own wavelength's centroid.
+        geo_spot_um: µm, the largest distance of a ray from its own wavelength's centroid, of the
+            wavelengths that count.
     """
 
     field: tuple[float, float]
@@ -45,6 +46,7 @@ class LensSummary(FirstOrderNumbers):
     Attributes:
         name: of the lens.
         wavelengths: nm.
+        weights: shares of the wavelengths in polychromatic values; they sum to one.
         field_unit: `°` or `mm`.
         fields: of the lens.
         seidel_field: degrees or mm, the edge of the field that the sums are of.
@@ -54,6 +56,7 @@ class LensSummary(FirstOrderNumbers):
 
     name: str
     wavelengths: tuple[float, ...]
+    weights: tuple[float, ...]
     field_unit: str
     fields: tuple[FieldSummary, ...]
     seidel_field: float
@@ -104,7 +107,8 @@ class LensSummary(FirstOrderNumbers):
         """Return the lens's name and the wavelengths."""
         lines = ", ".join(f"{wave:g}" for wave in self.wavelengths)
         reference = f", reference {self.reference_wavelength:g} nm"
-        return printable(f"{self.name or 'Lens'}: {lines} nm") + (
+        weights = weights_text(self.weights)
+        return printable(f"{self.name or 'Lens'}: {lines} nm{weights}") + (
             reference if len(self.wavelengths) > 1 else ""
         )
 
@@ -150,12 +154,13 @@ def lens_summary(
     given = conditions(lens, fields, wavelengths, object_distance)
     spots = spot_diagram(exact, given.fields, given.wavelengths, _RAYS, given.object_distance)
     sums = seidel_sums(exact, given)
-    geo = spots.geo.nan_to_num(-math.inf).amax(-1)
+    geo = spots.geo[:, spots.wavelength_weight > 0.0].nan_to_num(-math.inf).amax(-1)
     first = first_order_numbers(exact, given.reference_wavelength, given.object_distance)
     return LensSummary(
         **vars(first),
         name=lens.name,
         wavelengths=tuple(given.wavelengths.tolist()),
+        weights=tuple(given.weights.tolist()),
         field_unit=given.field_unit,
         fields=tuple(
             FieldSummary(tuple(field), tuple(image), 1e3 * rms, 1e3 * far)

@@ -18,7 +18,7 @@ from dolens.lens_page.tables import (
     seidel_table,
     spot_radii_table,
 )
-from dolens.optics.fields import field_label
+from dolens.optics.fields import field_label, weights_text
 from dolens.optics.lens import Lens
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.
@@ -103,8 +103,10 @@ def summary(lens: Lens, where: Conditions) -> str:
     fields = ", ".join(field_label(point, where.field_unit) for point in where.fields)
     waves = ", ".join(f"{float(wave):g}" for wave in where.wavelengths)
     many = len(where.wavelengths) > 1
-    parts.append(f"field{'s' * (len(where.fields) > 1)} {fields}")
-    parts.append(f"wavelength{'s' * many} {waves} nm")
+    parts.append(
+        f"field{'s' * (len(where.fields) > 1)} {fields}{weights_text(where.field_weights)}"
+    )
+    parts.append(f"wavelength{'s' * many} {waves} nm{weights_text(where.weights)}")
     if many:
         parts.append(f"reference {where.reference_wavelength:g} nm")
     return " · ".join(parts)

@@ -40,6 +40,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
@@ -86,6 +87,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
         if not isinstance(wavelengths, list | tuple) or not wavelengths:
             raise InputError(f"{where}: 'wavelengths' must be a list of wavelengths in nm")
         wavelengths = [as_positive(w, f"{where}: 'wavelengths'") for w in wavelengths]
+        require_wavelengths(wavelengths, f"{where}: 'wavelengths'")
     reference = prescription.get("reference_wavelength")
     if reference is not None:
         reference = as_positive(reference, f"{where}: 'reference_wavelength'")
