@@ -1,5 +1,6 @@
 """A summary tells a lens's first-order data, Seidel sums and spot sizes at a glance."""
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -114,10 +115,12 @@ class LensSummary(FirstOrderNumbers):
 
     def __repr__(self) -> str:
         """Return the summary as text."""
+        note = [self.note] if self.note else []
         return "\n\n".join(
             [
                 self.heading,
                 text_table(("first order", "", ""), self.first_order_cells(), {0, 2}),
+                *note,
                 text_table(self.field_headings, self.field_cells()),
                 text_table(self.seidel_headings, self.seidel_cells(), {0, 1}),
             ]
@@ -127,6 +130,7 @@ class LensSummary(FirstOrderNumbers):
         """Return the summary as HTML, all text escaped."""
         return (
             html_table(("first order", "", ""), self.first_order_cells(), self.heading, {0, 2})
+            + (f"<p>{html.escape(self.note)}</p>" if self.note else "")
             + html_table(self.field_headings, self.field_cells())
             + html_table(self.seidel_headings, self.seidel_cells(), left={0, 1})
         )

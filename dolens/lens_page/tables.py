@@ -195,7 +195,7 @@ def first_order_table(lens: Lens, where: Conditions) -> Table:
             (quantity.name, number(quantity.value, quantity.digits), quantity.unit)
             for quantity in found.quantities()
         ],
-        f"At {where.reference_wavelength:g} nm.",
+        f"At {where.reference_wavelength:g} nm.  {found.note}".strip(),
         frozenset({0, 2}),
     )
 
