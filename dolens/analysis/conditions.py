@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
 from dolens.analysis.full_field import full_field, three_digits
 from dolens.analysis.ray_intercepts import field_unit
-from dolens.analysis.spot_diagram import spectral_shares
 from dolens.errors import InputError
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
@@ -40,6 +40,8 @@ class Conditions:
         field_unit: `°` or `mm`.
         wavelengths: (W,), nm, float64.
         weights: (W,), shares of the wavelengths in polychromatic values; they sum to one.
+        field_weights: (F,), shares of the fields in means over them; they sum to one.  The lens's
+            own where the fields are, else equal ones.
         reference_wavelength: nm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
     """
@@ -48,6 +50,7 @@ class Conditions:
     field_unit: str
     wavelengths: Tensor
     weights: Tensor
+    field_weights: Tensor
     reference_wavelength: float
     object_distance: float | None
 
@@ -91,27 +94,23 @@ def conditions(
         wavelengths: nm.
         object_distance: mm in front of the first vertex, `inf` for infinity; None for the lens's
             own.
-        wavelength_weights: (W,), of any sum; None for the lens's own, where the wavelengths are its
-            own too, else for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
-        InputError: a value of another shape, or not finite, or a wavelength that is not positive.
+        InputError: a value of another shape, or not finite, or a wavelength that no light has.
     """
     distance = own_distance(lens, object_distance)
     points = own_fields(lens, distance) if fields is None else field_points(fields)
     if wavelengths is None:
-        if wavelength_weights is None:
-            wavelength_weights = lens.wavelength_weights
         waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
     else:
-        waves = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu().reshape(-1)
-        if not len(waves) or not bool((torch.isfinite(waves) & (waves > 0.0)).all()):
-            raise InputError(f"wavelengths must be positive numbers in nm, not {wavelengths}")
+        waves = as_wavelengths(wavelengths)
     return Conditions(
         points,
         field_unit(distance),
         waves,
-        spectral_shares(wavelength_weights, len(waves)),
+        spectral_shares(lens, waves, wavelength_weights),
+        field_shares(lens, None if fields is None else points),
         lens.primary_wavelength,
         distance,
     )
@@ -173,6 +172,25 @@ def own_fields(lens: Lens, object_distance: float | None) -> Tensor:
         return torch.rad2deg((-points * vergence(lens.object_distance)).atan())
     require_from_the_front(points, "an object at a finite distance")
     return -torch.deg2rad(points).tan() * object_distance
+
+
+def field_shares(lens: Lens, points: Tensor | None = None) -> Tensor:
+    """Return the shares (F,) of fields in means over them, float64; they sum to one.
+
+    Args:
+        lens: whose weights count where these are its own fields; others count alike.
+        points: (F, 2); None for the lens's own.
+    """
+    own = lens.fields
+    if points is None:
+        count = len(own_fields(lens, own_distance(lens))) if own is None else len(own.points)
+    else:
+        count = len(points)
+        if own is None or points.tolist() != [list(map(float, point)) for point in own.points]:
+            own = None
+    weights = [1.0] * count if own is None or own.weights is None else own.weights
+    shares = torch.tensor(weights, dtype=torch.float64)
+    return shares / shares.sum()
 
 
 def wavelength_interval(lens: Lens) -> tuple[float, float]:

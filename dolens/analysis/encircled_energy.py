@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.analysis.ray_intercepts import (
     in_double_precision,
     trace_ray_intercepts,
     uniform_pupil_points,
 )
-from dolens.analysis.spot_diagram import AIRY, moments, spectral_shares, working_f_numbers
+from dolens.analysis.spot_diagram import AIRY, moments, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
@@ -23,7 +24,7 @@ class EncircledEnergy:
     Attributes:
         fields: (F, 2), degrees or mm.
         field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
+        wavelengths: (W,), nm, those that count.
         radii_um: (Q,), µm from the centroid of the polychromatic light.
         energy: (F, Q), from 0 to 1, share of the light that passes the lens; NaN where none does.
         airy_radius_um: µm, 1.22·λ·N at the wavelengths' mean, with the paraxial working F-number.
@@ -76,7 +77,7 @@ def encircled_energy(
         radii_um: (Q,), µm, ascending; None for 101 from zero to the largest spot's.
         rays: of each field and wavelength, a multiple of four, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, radii that do not ascend from
@@ -85,9 +86,8 @@ def encircled_energy(
     lens = in_double_precision(lens)
     pupil, weight = uniform_pupil_points(rays)
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
-    waves = intercepts.wavelengths
-    spectrum = spectral_shares(wavelength_weights, len(waves))
+    waves, spectrum = that_count(lens, wavelengths, wavelength_weights)
+    intercepts = trace_ray_intercepts(lens, fields, waves, pupil, object_distance)
     light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     centroid, _ = moments(points, light)

@@ -1,4 +1,9 @@
-"""Fields and wavelengths of an analysis, as a caller gives them."""
+"""Fields and wavelengths of an analysis, as a caller gives them, and how much each wavelength
+counts.
+
+A wavelength of weight zero does not count in a polychromatic value at all: the value is what it
+would be, were the wavelength not there.  What is shown of each wavelength alone knows no weights.
+"""
 
 from collections.abc import Sequence
 
@@ -6,6 +11,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
+from dolens.optics.lens import Lens
 
 
 def as_fields_and_wavelengths(
@@ -21,7 +28,75 @@ def as_fields_and_wavelengths(
     field = torch.as_tensor(fields, dtype=torch.float64, device=device)
     if field.ndim != 2 or field.shape[-1] != 2 or len(field) == 0:
         raise InputError(f"fields must be pairs (x, y), at least one, not {fields}")
-    wave = torch.as_tensor(wavelengths, dtype=torch.float64, device=device).reshape(-1)
-    if len(wave) == 0:
+    return field, as_wavelengths(wavelengths).to(field.device)
+
+
+def as_wavelengths(wavelengths: float | Sequence[float] | Tensor) -> Tensor:
+    """Return wavelengths (W,), nm, in double precision on the CPU.
+
+    Raises:
+        InputError: none, or one that no light has; see `require_wavelengths`.
+    """
+    waves = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu().reshape(-1)
+    if len(waves) == 0:
         raise InputError(f"wavelengths must be numbers (nm), at least one, not {wavelengths}")
-    return field, wave
+    require_wavelengths(waves.tolist())
+    return waves
+
+
+def spectral_shares(
+    lens: Lens,
+    wavelengths: Sequence[float] | Tensor,
+    weights: Sequence[float] | Tensor | None = None,
+) -> Tensor:
+    """Return the shares (W,) of wavelengths in polychromatic values, float64; they sum to one.
+
+    Args:
+        lens: whose own weights count where none are given and the wavelengths are its own, in any
+            order; other wavelengths then count alike.
+        wavelengths: (W,), nm.
+        weights: (W,), of any sum.
+
+    Raises:
+        InputError: another number of weights, a negative one, or none that is positive.
+    """
+    waves = as_wavelengths(wavelengths)
+    if weights is None:
+        weights = _own_weights(lens, waves)
+    shares = torch.as_tensor(weights, dtype=torch.float64).cpu()
+    good = shares.shape == waves.shape and bool((shares.isfinite() & (shares >= 0.0)).all())
+    if not good or not float(shares.sum()) > 0.0:
+        raise InputError(
+            f"wavelength_weights must be {len(waves)} weights, none negative and not all zero, not "
+            f"{weights}"
+        )
+    return shares / shares.sum()
+
+
+def that_count(
+    lens: Lens,
+    wavelengths: Sequence[float] | Tensor,
+    weights: Sequence[float] | Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return the wavelengths (nm) whose weight is not zero, and their shares, both (W,).
+
+    Arguments are those of `spectral_shares`.
+    """
+    shares, waves = spectral_shares(lens, wavelengths, weights), as_wavelengths(wavelengths)
+    return waves[shares > 0.0], shares[shares > 0.0]
+
+
+def _own_weights(lens: Lens, waves: Tensor) -> Sequence[float] | Tensor:
+    """Return the lens's weights of its own wavelengths; ones for others."""
+    own = torch.tensor(lens.wavelengths or (), dtype=torch.float64)
+    alike = torch.ones_like(waves)
+    if lens.wavelength_weights is None or own.shape != waves.shape:
+        return alike
+    here, there = waves.argsort(stable=True), own.argsort(stable=True)
+    # Wavelengths may have been in single precision.
+    if not torch.allclose(waves[here], own[there], rtol=1e-6, atol=0.0):
+        return alike
+    weights = torch.as_tensor(lens.wavelength_weights, dtype=torch.float64)
+    if weights.shape != own.shape:
+        return lens.wavelength_weights
+    return alike.index_copy(0, here, weights[there])

@@ -9,6 +9,9 @@ import torch
 from dolens.analysis.spot_diagram import AIRY
 from dolens.optics.lens import Lens
 
+# Sections that differ by less, of themselves or in mm, are alike.
+_ALIKE = 1e-6
+
 
 class Quantity(NamedTuple):
     """One row of a table of numbers.
@@ -26,12 +29,34 @@ class Quantity(NamedTuple):
     digits: int = 6
 
 
+class SectionNumbers(NamedTuple):
+    """First-order data of one section of a lens whose two sections differ, mm.
+
+    Attributes:
+        name: `x–z` or `y–z`.
+        efl: effective focal length.
+        bfd: back focal distance.
+        f_number: EFL over the entrance pupil's diameter.
+        entrance_pupil_diameter: along the section.
+        defocus: from the paraxial image to the sensor.
+    """
+
+    name: str
+    efl: float
+    bfd: float
+    f_number: float
+    entrance_pupil_diameter: float
+    defocus: float
+
+
 @dataclass(frozen=True)
 class FirstOrderNumbers:
     """First-order data of a lens at its reference wavelength; lengths in mm, z from the first
     vertex.
 
-    Infinite values are `inf`: the EFL of an afocal lens, the pupil of a telecentric one.
+    Infinite values are `inf`: the EFL of an afocal lens, the pupil of a telecentric one.  Of a lens
+    whose two sections differ the numbers are those of its mean curvatures, and `sections` has those
+    of each.
 
     Attributes:
         reference_wavelength: nm.
@@ -53,6 +78,9 @@ class FirstOrderNumbers:
         length: first to last vertex.
         total_track: first vertex to sensor.
         airy_radius_um: µm, 1.22·λ·N with the working F-number.
+        sections: x–z and y–z where they differ, else empty.
+        stop_note: a sentence where the stop is smaller than the aperture that the prescription asks
+            for, else empty.
     """
 
     reference_wavelength: float
@@ -74,6 +102,8 @@ class FirstOrderNumbers:
     length: float
     total_track: float
     airy_radius_um: float
+    sections: tuple[SectionNumbers, ...]
+    stop_note: str
 
     def quantities(self) -> list[Quantity]:
         """Return the rows of a table; those of a near object only where there is one."""
@@ -84,21 +114,37 @@ class FirstOrderNumbers:
         ]
         from_first = "mm from the first vertex"
         return [
-            Quantity("effective focal length", self.efl, "mm"),
-            Quantity("back focal distance", self.bfd, "mm behind the last vertex"),
+            *self._by_section("effective focal length", "efl", "mm"),
+            *self._by_section("back focal distance", "bfd", "mm behind the last vertex"),
             Quantity("front focal distance", self.ffd, from_first),
-            Quantity("F-number", self.f_number, "focal length over entrance pupil"),
+            *self._by_section("F-number", "f_number", "focal length over entrance pupil"),
             *(near if math.isfinite(self.object_distance) else ()),
-            Quantity("entrance pupil diameter", self.entrance_pupil_diameter, "mm"),
+            *self._by_section("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
             Quantity("entrance pupil position", self.entrance_pupil_z, from_first),
             Quantity("exit pupil diameter", self.exit_pupil_diameter, "mm"),
             Quantity("exit pupil position", self.exit_pupil_z, from_first),
             Quantity("front principal plane", self.front_principal_z, from_first),
             Quantity("rear principal plane", self.rear_principal_z, from_first),
-            Quantity("paraxial image", 0.0 - self.defocus, "mm behind the sensor"),
+            *self._by_section("paraxial image", "defocus", "mm behind the sensor", -1.0),
             Quantity("length of the lens", self.length, "mm, first to last vertex"),
             Quantity("total track", self.total_track, "mm, first vertex to sensor"),
             Quantity("Airy radius", self.airy_radius_um, "µm on the sensor"),
+        ]
+
+    @property
+    def note(self) -> str:
+        """Return what a reader of the table must know; empty for most lenses."""
+        mean = "What names no section is that of the mean curvatures of both."
+        return " ".join(filter(None, (mean if self.sections else "", self.stop_note)))
+
+    def _by_section(self, name: str, what: str, unit: str, sign: float = 1.0) -> list[Quantity]:
+        """Return a quantity of the lens, or of each section where these differ."""
+        values = {getattr(own, what) for own in self.sections}
+        if len(values) < 2:
+            return [Quantity(name, 0.0 + sign * getattr(self, what), unit)]
+        return [
+            Quantity(f"{name}, {own.name}", 0.0 + sign * getattr(own, what), unit)
+            for own in self.sections
         ]
 
 
@@ -115,6 +161,16 @@ def first_order_numbers(
     """
     first = lens.first_order(wavelength, object_distance)
     vertices = lens.system().vertices
+    both = []
+    for meridian in "xy":
+        own = lens.first_order(wavelength, object_distance, meridian)
+        numbers = own.efl, own.bfd, own.f_number, own.entrance_pupil.diameter
+        values = *map(float, numbers), float(vertices[-1] - own.image)
+        both.append(SectionNumbers(f"{meridian}–z", *values))
+    alike = all(
+        one == other or math.isclose(one, other, rel_tol=_ALIKE, abs_tol=_ALIKE)
+        for one, other in zip(both[0][1:], both[1][1:], strict=True)
+    )
     return FirstOrderNumbers(
         reference_wavelength=wavelength,
         object_distance=math.inf if object_distance is None else object_distance,
@@ -135,4 +191,6 @@ def first_order_numbers(
         length=float(vertices[-2]),
         total_track=float(vertices[-1]),
         airy_radius_um=1e-3 * AIRY * wavelength * abs(float(first.working_f_number)),
+        sections=() if alike else tuple(both),
+        stop_note=lens.stop_note,
     )

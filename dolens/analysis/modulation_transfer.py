@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.analysis.ray_intercepts import (
     in_double_precision,
     trace_ray_intercepts,
     uniform_pupil_points,
 )
-from dolens.analysis.spot_diagram import AIRY, spectral_shares, spot_diagram, working_f_numbers
+from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.launching import field_line
 from dolens.optics.lens import Lens
@@ -38,7 +39,7 @@ class Modulation:
     Attributes:
         fields: (F, 2), degrees or mm.
         field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
+        wavelengths: (W,), nm, those that count.
         frequencies: (Q,), cycles/mm on the sensor.
         tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
             the y-z plane and on the axis; NaN where no light passes.
@@ -136,7 +137,7 @@ def modulation(
         rays: of each field and wavelength, a multiple of four, before apertures clip any.  What is
             left of contrast far beyond the first zero is noise of 1/√rays or less.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
@@ -145,9 +146,9 @@ def modulation(
     pupil, weight = uniform_pupil_points(rays)
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
-    field, waves = intercepts.fields, intercepts.wavelengths
-    spectrum = spectral_shares(wavelength_weights, len(waves))
+    waves, spectrum = that_count(lens, wavelengths, wavelength_weights)
+    intercepts = trace_ray_intercepts(lens, fields, waves, pupil, object_distance)
+    field = intercepts.fields
     light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
@@ -183,6 +184,7 @@ def frequency_range(
     wavelengths: Sequence[float] | Tensor,
     object_distance: float | None = None,
     count: int = 61,
+    wavelength_weights: Sequence[float] | None = None,
 ) -> Tensor:
     """Return frequencies (count,), cycles/mm, from zero to where the sharpest field leaves little.
 
@@ -191,7 +193,8 @@ def frequency_range(
     or 5 times a power of ten.
     """
     lens = in_double_precision(lens)
-    spots = spot_diagram(lens, fields, wavelengths, 400, object_distance)
+    waves, shares = that_count(lens, wavelengths, wavelength_weights)
+    spots = spot_diagram(lens, fields, waves, 400, object_distance, shares)
     cutoff = float((AIRY / spots.airy_radius).min())
     radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
     end = min(cutoff, 0.68 / max(radius, 1e-9))

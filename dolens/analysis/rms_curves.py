@@ -50,7 +50,8 @@ def rms_against_field(
         count: fields, with the axis and the edge.
         rays: of each spot, a multiple of four, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of the polychromatic spot, of any sum; None for equal ones.
+        wavelength_weights: (W,), of the polychromatic spot, of any sum; None: see
+            `spectral_shares`.
 
     Raises:
         InputError: no field is given and the lens has none of that kind, or fewer than two are

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import spectral_shares
 from dolens.analysis.ray_intercepts import (
     in_double_precision,
     trace_ray_intercepts,
     uniform_pupil_points,
 )
-from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
@@ -70,7 +70,7 @@ def spot_diagram(
     wavelengths: Sequence[float] | Tensor,
     rays: int = 2000,
     object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | Tensor | None = None,
 ) -> SpotDiagram:
     """Trace rays spread uniformly over the stop, at every field and wavelength.
 
@@ -82,7 +82,7 @@ def spot_diagram(
             thousand err by some 1e-4 of themselves where only the stop clips, and by a few
             hundredths at the edge of a field that has lost most of its light.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
@@ -91,14 +91,14 @@ def spot_diagram(
     pupil, weight = uniform_pupil_points(rays)
     intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
     points, valid = intercepts.points, intercepts.valid
-    spectrum = spectral_shares(wavelength_weights, points.shape[1])
+    waves = intercepts.wavelengths
+    spectrum = spectral_shares(lens, waves, wavelength_weights)
 
     light = weight * valid
     centroid, mean_square = moments(points, light)
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
     every = (light * spectrum[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
-    waves = intercepts.wavelengths
     return SpotDiagram(
         fields=intercepts.fields,
         field_unit=intercepts.field_unit,
@@ -133,22 +133,6 @@ def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
     centroid = torch.where(there, share * points, dark).sum(-2)
     square = share * (points - centroid[..., None, :]).square()
     return centroid, torch.where(there, square, dark).sum((-2, -1))
-
-
-def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
-    """Return normalised wavelength weights, (count,), float64; equal ones where none are given.
-
-    Raises:
-        InputError: another number of weights, a negative one, or none that is positive.
-    """
-    if weights is None:
-        return torch.full((count,), 1.0 / count, dtype=torch.float64)
-    shares = torch.as_tensor(weights, dtype=torch.float64)
-    if shares.shape != (count,) or bool((shares < 0.0).any()) or not float(shares.sum()) > 0.0:
-        raise InputError(
-            f"wavelength_weights must be {count} weights, none negative, not {weights}"
-        )
-    return shares / shares.sum()
 
 
 def working_f_numbers(lens: Lens, wavelengths: Tensor, object_distance: float | None) -> Tensor:

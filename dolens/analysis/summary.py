@@ -1,5 +1,6 @@
 """A summary tells a lens's first-order data, Seidel sums and spot sizes at a glance."""
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from dolens.analysis.first_order_numbers import FirstOrderNumbers, first_order_n
 from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.optics.fields import point_text
+from dolens.optics.fields import point_text, weights_text
 from dolens.optics.lens import Lens
 from dolens.optics.tables import html_table, printable, text_table
 
@@ -29,7 +30,8 @@ class FieldSummary:
             does not arrive.
         rms_spot_um: µm, RMS radius of all wavelengths together about their centroid; NaN where no
             light passes.
-        geo_spot_um: µm, the largest distance of a ray from its own wavelength's centroid.
+        geo_spot_um: µm, the largest distance of a ray from its own wavelength's centroid, of the
+            wavelengths that count.
     """
 
     field: tuple[float, float]
@@ -45,6 +47,7 @@ class LensSummary(FirstOrderNumbers):
     Attributes:
         name: of the lens.
         wavelengths: nm.
+        weights: shares of the wavelengths in polychromatic values; they sum to one.
         field_unit: `°` or `mm`.
         fields: of the lens.
         seidel_field: degrees or mm, the edge of the field that the sums are of.
@@ -54,6 +57,7 @@ class LensSummary(FirstOrderNumbers):
 
     name: str
     wavelengths: tuple[float, ...]
+    weights: tuple[float, ...]
     field_unit: str
     fields: tuple[FieldSummary, ...]
     seidel_field: float
@@ -104,16 +108,19 @@ class LensSummary(FirstOrderNumbers):
         """Return the lens's name and the wavelengths."""
         lines = ", ".join(f"{wave:g}" for wave in self.wavelengths)
         reference = f", reference {self.reference_wavelength:g} nm"
-        return printable(f"{self.name or 'Lens'}: {lines} nm") + (
+        weights = weights_text(self.weights)
+        return printable(f"{self.name or 'Lens'}: {lines} nm{weights}") + (
             reference if len(self.wavelengths) > 1 else ""
         )
 
     def __repr__(self) -> str:
         """Return the summary as text."""
+        note = [self.note] if self.note else []
         return "\n\n".join(
             [
                 self.heading,
                 text_table(("first order", "", ""), self.first_order_cells(), {0, 2}),
+                *note,
                 text_table(self.field_headings, self.field_cells()),
                 text_table(self.seidel_headings, self.seidel_cells(), {0, 1}),
             ]
@@ -123,6 +130,7 @@ class LensSummary(FirstOrderNumbers):
         """Return the summary as HTML, all text escaped."""
         return (
             html_table(("first order", "", ""), self.first_order_cells(), self.heading, {0, 2})
+            + (f"<p>{html.escape(self.note)}</p>" if self.note else "")
             + html_table(self.field_headings, self.field_cells())
             + html_table(self.seidel_headings, self.seidel_cells(), left={0, 1})
         )
@@ -150,12 +158,13 @@ def lens_summary(
     given = conditions(lens, fields, wavelengths, object_distance)
     spots = spot_diagram(exact, given.fields, given.wavelengths, _RAYS, given.object_distance)
     sums = seidel_sums(exact, given)
-    geo = spots.geo.nan_to_num(-math.inf).amax(-1)
+    geo = spots.geo[:, spots.wavelength_weight > 0.0].nan_to_num(-math.inf).amax(-1)
     first = first_order_numbers(exact, given.reference_wavelength, given.object_distance)
     return LensSummary(
         **vars(first),
         name=lens.name,
         wavelengths=tuple(given.wavelengths.tolist()),
+        weights=tuple(given.weights.tolist()),
         field_unit=given.field_unit,
         fields=tuple(
             FieldSummary(tuple(field), tuple(image), 1e3 * rms, 1e3 * far)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
+from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths, spectral_shares
 from dolens.analysis.ray_intercepts import field_unit
-from dolens.analysis.spot_diagram import spectral_shares
 from dolens.diffraction.entrance_beam import EntranceBeam, find_beam
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
@@ -52,7 +51,7 @@ def field_wavefronts(
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
     object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | Tensor | None = None,
     samples: int = 32,
 ) -> FieldWavefronts:
     """Trace the wavefronts of every field and wavelength.
@@ -62,7 +61,7 @@ def field_wavefronts(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
         samples: rays along each side of a box about each beam.
 
     Raises:
@@ -71,7 +70,7 @@ def field_wavefronts(
     """
     system = lens.system().double()
     field, waves = as_fields_and_wavelengths(fields, wavelengths, system.device)
-    spectrum = spectral_shares(wavelength_weights, len(waves)).to(field)
+    spectrum = spectral_shares(lens, waves, wavelength_weights).to(field)
     shape = (len(field), len(waves))
     every = field.repeat_interleave(len(waves), 0)
     points = object_points(every, object_distance)

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.diffraction.field import direct_field
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
@@ -85,7 +86,7 @@ def huygens_point_spread(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
         cells: M, along each side of the window; the irradiance is that at their centres.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
         rays: along each side of a box about each beam; None: so many that the phases of neighbours
@@ -98,7 +99,8 @@ def huygens_point_spread(
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    waves, shares = that_count(lens, wavelengths, wavelength_weights)
+    found = field_wavefronts(lens, fields, waves, object_distance, shares)
     weights = found.weights.to(lens.device)
     rows = []
     for number, lit in enumerate(found.lit.any(1).tolist()):
@@ -136,7 +138,8 @@ def huygens_window(
     Arguments are those of `huygens_point_spread`, of one field (2,).  Without light both are those
     of a perfect lens.
     """
-    found = field_wavefronts(lens, field[None], wavelengths, object_distance, wavelength_weights)
+    waves, shares = that_count(lens, wavelengths, wavelength_weights)
+    found = field_wavefronts(lens, field[None], waves, object_distance, shares)
     airy = airy_radius_um(lens, found, object_distance)
     if not bool(found.lit.any()):
         return airy, airy

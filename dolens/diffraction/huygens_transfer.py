@@ -39,7 +39,7 @@ def huygens_modulation(
         wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Returns:
         The curves; the limits, which need a second pupil, are NaN.

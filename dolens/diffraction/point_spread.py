@@ -128,7 +128,7 @@ def point_spread(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
         cells: M, along each side of the window.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
 
@@ -180,7 +180,7 @@ def diffraction_encircled_energy(
         radii_um: (Q,), µm, ascending, from the centroid; None for 101 from zero to the edge of the
             largest window of `point_spread`.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.

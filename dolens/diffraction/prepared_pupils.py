@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.diffraction.field_pupil import FieldPupil
 from dolens.diffraction.field_wavefronts import FieldWavefronts, field_wavefronts, object_points
 from dolens.diffraction.pupil_edges import coverage
@@ -23,7 +24,7 @@ class PreparedPupils:
     """The pupils of F fields, which several analyses may share.
 
     Attributes:
-        wavefronts: of all fields and wavelengths.
+        wavefronts: of all fields and of the wavelengths that count.
         pupils: of every field; None for a field without light.
     """
 
@@ -44,7 +45,8 @@ def prepare_pupils(
 
     Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
     """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    waves, shares = that_count(lens, wavelengths, wavelength_weights)
+    found = field_wavefronts(lens, fields, waves, object_distance, shares)
     return PreparedPupils(found, _field_pupils(lens, found, object_distance, most_samples))
 
 

@@ -72,7 +72,7 @@ def diffraction_modulation(
         wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import Conditions
@@ -122,7 +123,8 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
 
     Args:
         lens: as designed, in double precision; it stays as it is.
-        where: fields, which are taken on both sides of the axis in x and in y, and wavelengths.
+        where: fields, which are taken on both sides of the axis in x and in y, and wavelengths,
+            with their weights.
         source: `default`, or a YAML file; see the module.
 
     Raises:
@@ -139,18 +141,20 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         lens = copy.deepcopy(lens).requires_grad_(True)
         given, factor = _read(lens, Path(source), notes)
     tolerances = tolerances_from(lens, given, factor)
-    fields = fields_all_around(where.fields.tolist())
+    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
+    counts = where.weights > 0.0
     spots = gaussian_quadrature(
         lens,
-        fields,
-        where.wavelengths.tolist(),
+        list(fields),
+        where.wavelengths[counts].tolist(),
         _RINGS,
         _ARMS,
         where.object_distance,
         symmetry=False,
     )
     model = linear_spots(lens, spots, tolerances.names)
-    weights = spot_weights(None, spots.count)
+    of_fields = where.weights.new_tensor(list(fields.values()))
+    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
     return Offenders(
         tolerances,
         sensitivities(model, tolerances.steps, weights),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import torch
 
 from dolens.analysis.conditions import Conditions, conditions
+from dolens.analysis.first_order_numbers import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.lens_page.published_table import published_table
@@ -18,7 +19,7 @@ from dolens.lens_page.tables import (
     seidel_table,
     spot_radii_table,
 )
-from dolens.optics.fields import field_label
+from dolens.optics.fields import field_label, weights_text
 from dolens.optics.lens import Lens
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.
@@ -95,19 +96,31 @@ def lens_overview(lens: Lens) -> Overview:
 
 def summary(lens: Lens, where: Conditions) -> str:
     """Return focal length, F-number, fields and wavelengths of a lens in one line."""
-    first = lens.first_order(where.reference_wavelength, where.object_distance)
-    efl, f_number = float(first.efl), abs(float(first.working_f_number))
-    parts = [f"f = {number(efl)} mm" if abs(efl) < 1e9 else "afocal", f"F/{number(f_number, 3)}"]
+    first = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
+    if first.sections:
+        parts = [f"{_focal_length(own.efl)} in {own.name}" for own in first.sections]
+    else:
+        parts = [_focal_length(first.efl)]
+    # Of two sections, that of y–z, which files mean.
+    y = lens.first_order(where.reference_wavelength, where.object_distance, "y")
+    of_section = f" in {first.sections[-1].name}" if first.sections else ""
+    parts.append(f"F/{number(abs(float(y.working_f_number)), 3)}{of_section}")
     if where.object_distance is not None:
         parts.append(f"object at {number(where.object_distance)} mm")
     fields = ", ".join(field_label(point, where.field_unit) for point in where.fields)
     waves = ", ".join(f"{float(wave):g}" for wave in where.wavelengths)
     many = len(where.wavelengths) > 1
-    parts.append(f"field{'s' * (len(where.fields) > 1)} {fields}")
-    parts.append(f"wavelength{'s' * many} {waves} nm")
+    parts.append(
+        f"field{'s' * (len(where.fields) > 1)} {fields}{weights_text(where.field_weights)}"
+    )
+    parts.append(f"wavelength{'s' * many} {waves} nm{weights_text(where.weights)}")
     if many:
         parts.append(f"reference {where.reference_wavelength:g} nm")
     return " · ".join(parts)
+
+
+def _focal_length(efl: float) -> str:
+    return f"f = {number(efl)} mm" if abs(efl) < 1e9 else "afocal"
 
 
 def _section(title: str, make: Callable[[], Table]) -> TableSection:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from dolens.analysis.conditions import field_points
+from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
 from dolens.errors import InputError
 from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.fields import Fields
@@ -25,8 +26,8 @@ def prepared_lens(
     Args:
         lens: stays as it is.
         fields: (x, y) of each: degrees for an object at infinity, else mm on the object.
-        wavelengths: nm; the reference wavelength stays if it is one of them, and else is the middle
-            one in their order.
+        wavelengths: nm; they count alike unless they are the lens's own.  The reference wavelength
+            stays if it is one of them, and else is the middle one in their order.
         f_number: focal length over the diameter of the entrance pupil, which the stop is set to.
         entrance_pupil_diameter: mm, instead of an F-number.
 
@@ -35,11 +36,13 @@ def prepared_lens(
     """
     lens = copy.deepcopy(lens).to(device="cpu", dtype=torch.float64).requires_grad_(False)
     if wavelengths is not None:
-        waves = [float(wave) for wave in wavelengths]
-        if not waves or not all(math.isfinite(wave) and wave > 0.0 for wave in waves):
-            raise InputError(f"wavelengths must be positive numbers in nm, not {waves}")
+        waves = as_wavelengths(wavelengths).tolist()
         if len(set(waves)) < len(waves):
             raise InputError(f"wavelengths: one is given twice, {waves}")
+        # Its own wavelengths keep their weights; others count alike.
+        shares = spectral_shares(lens, waves)
+        weighted = lens.wavelength_weights is not None
+        lens.wavelength_weights = tuple(shares.tolist()) if weighted else None
         lens.wavelengths = tuple(waves)
         if lens.reference_wavelength not in waves:
             lens.reference_wavelength = waves[(len(waves) - 1) // 2]

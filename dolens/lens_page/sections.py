@@ -279,7 +279,9 @@ class PageSections:
             bright = light >= _BRIGHT * light.max()
             dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
             if dim and bool(bright.any()):
-                where = replace(where, fields=where.fields[bright])
+                where = replace(
+                    where, fields=where.fields[bright], field_weights=where.field_weights[bright]
+                )
                 problems.append(f"tolerances at {', '.join(dim)}: too little light passes")
         assert self.tolerances is not None  # there is no such section without
         found = offenders(self.lens, where, self.tolerances)

@@ -41,7 +41,7 @@ def states_table(lens: Lens) -> Table:
         values = [to_file_units(base, float(there.get_parameter(base))) for base in shown]
         columns.append(
             (
-                number(first.efl),
+                " × ".join(number(own.efl) for own in first.sections or (first,)),
                 "" if efl is None else number(efl),
                 number(abs(first.working_f_number), 3),
                 f"{number(edge)}{where.field_unit}",

@@ -11,7 +11,7 @@ from dolens.analysis.first_order_numbers import first_order_numbers
 from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.optics.elements import POSE, TILTS
-from dolens.optics.fields import field_label
+from dolens.optics.fields import field_label, weights_text
 from dolens.optics.lens import Lens
 from dolens.optics.materials import NO_GLASS
 from dolens.optics.prescription_table import SurfaceRow, prescription_table
@@ -195,7 +195,7 @@ def first_order_table(lens: Lens, where: Conditions) -> Table:
             (quantity.name, number(quantity.value, quantity.digits), quantity.unit)
             for quantity in found.quantities()
         ],
-        f"At {where.reference_wavelength:g} nm.",
+        f"At {where.reference_wavelength:g} nm.  {found.note}".strip(),
         frozenset({0, 2}),
     )
 
@@ -234,7 +234,10 @@ def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
     airy = [number(1e3 * value, 4, zeros=True) for value in spots.airy_radius.tolist()]
     rows.append(("Airy radius", *airy, *[""] * many))
     caption = "RMS radii in µm about the centroid of each spot"
-    caption += "; polychromatic: about that of all wavelengths together." if many else "."
+    if many:
+        caption += "; polychromatic: about that of all wavelengths together"
+        caption += f"{weights_text(spots.wavelength_weight)}"
+    caption += "."
     if bool(spots.rms.isnan().any()):
         caption += "  – : no light passes."
     return Table(heads + ("polychromatic",) * many, rows, caption, total=True)

@@ -68,14 +68,14 @@ def lens_sensitivity(lens: Lens) -> LensSensitivity:
     where = conditions(lens)
     made = with_glass_elements(lens)
     tolerances = tolerances_from(made, usual_tolerances(made))
-    fields = fields_all_around(where.fields.tolist())
-    waves = where.wavelengths.tolist()
+    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
+    counts = where.weights > 0.0
+    waves = where.wavelengths[counts].tolist()
     spots = gaussian_quadrature(
-        made, fields, waves, _RINGS, _ARMS, where.object_distance, symmetry=False
+        made, list(fields), waves, _RINGS, _ARMS, where.object_distance, symmetry=False
     )
-    # Fields on the axis are one of all, and those beside it four: the design's fields count alike.
-    alike = torch.tensor([1.0 if field == (0.0, 0.0) else 0.25 for field in fields])
-    weights = spot_weights(torch.outer(alike.double(), where.weights).flatten(), spots.count)
+    of_fields = where.weights.new_tensor(list(fields.values()))
+    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
     model = linear_spots(made, spots, tolerances.names)
     adding = contributions(model, tolerances, weights)
     errors = tolerances.draw(_LENSES, torch.Generator().manual_seed(_SEED))

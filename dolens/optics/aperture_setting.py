@@ -21,7 +21,7 @@ def with_aperture(
 
     Args:
         lens: the lens.
-        f_number: EFL over the diameter of the entrance pupil; or
+        f_number: EFL over the diameter of the entrance pupil, both of the y-z section; or
         entrance_pupil_diameter: mm.
 
     Raises:
@@ -38,7 +38,8 @@ def with_aperture(
     if not (target > 0.0 and math.isfinite(target)):
         raise InputError(f"{name} must be positive, not {target}")
     lens = copy.deepcopy(lens)
-    first = copy.deepcopy(lens).to(torch.float64).first_order(lens.primary_wavelength)
+    exact = copy.deepcopy(lens).to(torch.float64)
+    first = exact.first_order(lens.primary_wavelength, meridian="y")
     diameter = abs(float(first.efl)) / target if name == "f_number" else target
     surface = lens.surfaces[str(lens.stop)]
     if not isinstance(surface.aperture.edge, Circle):
@@ -47,6 +48,7 @@ def with_aperture(
     if not (math.isfinite(size) and size > 0.0):
         raise InputError(f"{name} {target:g}: no size of the stop makes this pupil")
     try:
+        lens.stop_note = ""
         surface.aperture = surface.aperture.resized(size)
         surface.check_aperture()
     except InputError as error:

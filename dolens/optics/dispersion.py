@@ -7,7 +7,7 @@ wavelength.  Wavelengths are those in air, as of the spectral lines that makers 
 `dolens.optics.agf_formulas` says which of them the formulas 1 to 13 of `.agf` catalogues are.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from torch import Tensor
 
@@ -19,14 +19,32 @@ Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
-# nm; no light is so short, and the square of a number that is too small is zero.
-_SHORTEST = 1e-9
+# nm: from the vacuum ultraviolet to the far infrared.  What lies beyond is another unit, µm or m.
+SHORTEST, LONGEST = 50.0, 1e5
 
 
-def require_positive(wavelength: float | Tensor) -> None:
-    """Raise `InputError` where a wavelength (nm) that is a number is not positive."""
-    if not isinstance(wavelength, Tensor) and not wavelength > _SHORTEST:
-        raise InputError(f"wavelength {wavelength:g} nm: it must be positive")
+def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
+    """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 100 µm.
+
+    Args:
+        wavelengths: nm.
+        where: what the message begins with, a file or a key.
+    """
+    for wavelength in wavelengths:
+        if not SHORTEST <= wavelength <= LONGEST:
+            before = f"{where}: " if where else ""
+            raise InputError(
+                f"{before}wavelength {wavelength:g} nm: allowed: {SHORTEST:g} to {LONGEST:g} nm "
+                "(wavelengths are in nm, so 0.55 µm is 550)"
+            )
+
+
+def require_wavelength(wavelength: float | Tensor) -> None:
+    """Raise `InputError` where a wavelength that is a number is none of light; a tensor's are not
+    looked at, which would wait for its device.
+    """
+    if not isinstance(wavelength, Tensor):
+        require_wavelengths([wavelength])
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:

@@ -122,6 +122,17 @@ def point_text(point: Sequence[float] | Tensor, digits: int = 6) -> str:
     return y if x == "0" else f"({x}, {y})"
 
 
+def weights_text(weights: Sequence[float] | Tensor) -> str:
+    """Return ` (weights 1, 2, 1)` for weights of any sum, the least positive one as unit; nothing
+    where all are the same.
+    """
+    numbers = [float(weight) for weight in weights]
+    unit = min((number for number in numbers if number > 0.0), default=1.0)
+    if all(abs(number - unit) <= 1e-9 * unit for number in numbers):
+        return ""
+    return f" (weights {', '.join(f'{number / unit:.4g}' for number in numbers)})"
+
+
 def field_label(point: Sequence[float] | Tensor, unit: str) -> str:
     """Return a field as a figure or a table shows it: `14°`, `(3, 14)°`, `−2 mm`.
 

@@ -124,6 +124,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.temperature = temperature
         self.pressure = pressure
         self.telecentric_object = telecentric_object
+        # A sentence where the stop is smaller than the aperture that its prescription asks for.
+        self.stop_note = ""
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
         self.surfaces = ModuleTable[Surface](

@@ -25,10 +25,20 @@ class LensRays:
     system: Callable[[], OpticalSystem]
 
     def first_order(
-        self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None
+        self,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+        meridian: str | None = None,
     ) -> FirstOrder:
-        """EFL, cardinal points, pupils, F-number, magnification at a wavelength in nm."""
-        return first_order(self.system(), wavelength, object_distance)
+        """EFL, cardinal points, pupils, F-number, magnification at a wavelength in nm.
+
+        Args:
+            wavelength: nm.
+            object_distance: mm, or None for infinity.
+            meridian: `x` or `y`, the section that they are of; None: of a lens whose sections
+                differ, those of the mean curvatures over azimuth.
+        """
+        return first_order(self.system().section(meridian), wavelength, object_distance)
 
     def paraxial_rays(
         self,

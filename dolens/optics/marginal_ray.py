@@ -35,7 +35,7 @@ def real_marginal_height(lens: Lens, paraxial: float) -> float:
     system = replace(system, surfaces=surfaces)
     wavelength = lens.primary_wavelength
     # The height at the stop is a·y + b·n·u of a ray that meets the first vertex at y with slope u.
-    (a, b), _ = matrix_to_stop(system, wavelength).tolist()
+    (a, b), _ = matrix_to_stop(system.section("y"), wavelength).tolist()
     if lens.object_distance is None or vergence(lens.object_distance) == 0.0:
         start, slope = [0.0, paraxial / abs(a), 0.0], 0.0
     else:

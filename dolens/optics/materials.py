@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.dispersion import require_positive
+from dolens.optics.dispersion import require_wavelength
 from dolens.optics.glass import Glass
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.mirrors import MIRROR, Mirror
@@ -70,9 +70,9 @@ class Material:
         a tensor gives a tensor of its shape.
 
         Raises:
-            InputError: the number is not positive.
+            InputError: the number is no wavelength of light.
         """
-        require_positive(wavelength)
+        require_wavelength(wavelength)
         if self.b == 0.0:
             return self.a
         return self.a + self.b / (wavelength * wavelength)

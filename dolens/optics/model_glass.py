@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dolens.optics.dispersion import require_positive
+from dolens.optics.dispersion import require_wavelength
 
 # Mercury's g line, nm.
 LINE_G = 435.8343
@@ -56,9 +56,9 @@ class ModelGlass:
         a tensor gives a tensor of its shape.
 
         Raises:
-            InputError: the number is not positive.
+            InputError: the number is no wavelength of light.
         """
-        require_positive(wavelength)
+        require_wavelength(wavelength)
         micrometres = wavelength / _NM_PER_UM
         return self.constant + self.a * micrometres**_FIRST + self.b * micrometres**_SECOND
 

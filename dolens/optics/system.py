@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.broken_axes import GlobalAxes, broken_axes
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
@@ -48,6 +49,8 @@ class OpticalSystem:
             `auto`; see `dolens.optics.backend.choose_backend`.
         index_offsets: added to the indices of these media, the same at all wavelengths; () where
             none is.
+        meridian: the section of the lens that first-order optics is of, `x` (the x-z plane) or `y`;
+            None: the mean over azimuth.  See `section`.
     """
 
     surfaces: Sequence[SurfaceState]
@@ -62,6 +65,7 @@ class OpticalSystem:
     image: SurfaceState | None = None
     from_the_side: bool = False
     index_offsets: tuple[Tensor | None, ...] = ()
+    meridian: str | None = None
 
     @cached_property
     def senses(self) -> tuple[float, ...]:
@@ -186,6 +190,16 @@ class OpticalSystem:
         surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
         laws = all(s.deflection is None or s.deflection.law.rotational for s in self.surfaces)
         return surfaces and laws and not self.elements
+
+    def section(self, meridian: str | None) -> "OpticalSystem":
+        """Return the same lens, whose first-order optics is that of one section; see `meridian`.
+
+        Raises:
+            InputError: another name than `x` and `y`.
+        """
+        if meridian not in (None, "x", "y"):
+            raise InputError(f"meridian: 'x', 'y' or None for the mean of both, not {meridian!r}")
+        return replace(self, meridian=meridian)
 
     def traced_by(self, backend: str) -> "OpticalSystem":
         """The same lens, traced by another implementation."""

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.analysis.conditions import field_shares
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.analysis.pupil_quadrature import (
     SpotRays,
     gaussian_quadrature,
@@ -46,7 +48,8 @@ class MeritSettings:
     Attributes:
         fields: (x, y), degrees or mm; None: the lens's own.
         wavelengths: nm; None: the lens's own.
-        field_weights: one for each field; None: all equal.
+        field_weights: one for each field; None: the lens's own where the fields are, else all
+            equal.  A field of weight zero has no rays.
         wavelength_weights: likewise.
         sampling: `gaussian_quadrature` or `square_grid`.
         sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`;
@@ -96,8 +99,22 @@ class MeritSettings:
         """Return (x, y) of every field that counts, degrees or mm.
 
         Raises:
-            InputError: neither the settings nor the lens name any, or one is not a pair.
+            InputError: neither the settings nor the lens name any, or one is not a pair, or weights
+                that do not fit.
         """
+        return self._fields(lens)[0]
+
+    def _fields(self, lens: Lens) -> tuple[list[Sequence[float]], Tensor]:
+        """Return the fields whose weight is not zero, and their weights (F,)."""
+        fields = self._all_fields(lens)
+        if self.field_weights is None:
+            weights = field_shares(lens, torch.tensor([list(f) for f in fields]).double())
+        else:
+            weights = _weights("field_weights", self.field_weights, len(fields))
+        counts = weights > 0.0
+        return [f for f, counted in zip(fields, counts, strict=True) if counted], weights[counts]
+
+    def _all_fields(self, lens: Lens) -> Sequence[Sequence[float]]:
         if self.fields is not None:
             if not self.fields:
                 raise InputError("merit.fields: is an empty list; give (x, y) in degrees")
@@ -115,12 +132,23 @@ class MeritSettings:
         """Return every wavelength that counts, nm.
 
         Raises:
-            InputError: neither the settings nor the lens name any.
+            InputError: neither the settings nor the lens name any, or weights that do not fit.
+        """
+        return self.spectrum_of(lens)[0].tolist()
+
+    def spectrum_of(self, lens: Lens) -> tuple[Tensor, Tensor]:
+        """Return every wavelength that counts, nm, and their shares, which sum to one, both (W,).
+
+        Raises:
+            InputError: as `wavelengths_of`.
         """
         wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
         if not wavelengths:
             raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
-        return wavelengths
+        weights = self.wavelength_weights
+        if weights is not None:
+            _weights("wavelength_weights", weights, len(wavelengths))
+        return that_count(lens, wavelengths, weights)
 
     def rays(self, lens: Lens) -> SpotRays:
         """Return the rays of all spots that pass the lens as it is now.
@@ -148,12 +176,9 @@ class MeritSettings:
             return with_chief_rays(lens, rays, lens.object_distance)
         return rays
 
-    def weights(self, rays: SpotRays) -> Tensor:
-        """Return the weight (S,) of every spot; they sum to one."""
-        number = len(rays.wavelengths.unique())
-        of_fields = _weights("field_weights", self.field_weights, rays.count // number)
-        of_waves = _weights("wavelength_weights", self.wavelength_weights, number)
-        weights = (of_fields[:, None] * of_waves).reshape(-1)
+    def weights(self, lens: Lens) -> Tensor:
+        """Return the weight (S,) of every spot of `rays`; they sum to one."""
+        weights = torch.outer(self._fields(lens)[1], self.spectrum_of(lens)[1]).flatten()
         return weights / weights.sum()
 
     def states_of(self, lens: Lens) -> dict[str, float]:
@@ -204,7 +229,7 @@ class MeritSettings:
         rays = self.rays(lens)
         common = (
             rays,
-            self.weights(rays),
+            self.weights(lens),
             self.reference,
             self.reference_spectrum,
             self.max_vignetting,

@@ -25,11 +25,12 @@ def caption(
 
     Args:
         what: the figure shows.
-        lens: the lens; its F-number is the paraxial one of its stop at the reference wavelength.
+        lens: the lens; its F-number is the paraxial one of its stop at the reference wavelength, in
+            the y-z section.
         wavelengths: nm.
         object_distance: mm; given, the working F-number and the distance are named.
     """
-    first = first_order(lens.system(), lens.primary_wavelength, object_distance)
+    first = first_order(lens.system().section("y"), lens.primary_wavelength, object_distance)
     number = abs(float(first.working_f_number))
     parts = []
     if math.isfinite(number):

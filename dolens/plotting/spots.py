@@ -48,7 +48,8 @@ def spots_figure(
     land apart are seen apart; or a panel for every field with all wavelengths in it.  The circle is
     Airy's, about the spot's centroid (overlaid: that of the reference or nearest wavelength); the
     cross is the chief ray of the reference wavelength, where it is near the light.  Above each
-    panel stand the RMS radius and the largest distance of a ray from the centroid.
+    panel stand the RMS radius and the largest distance of a ray from the centroid.  A wavelength
+    of weight zero is drawn as the others, and counts in neither number of all wavelengths together.
 
     Artists carry gids: `spot`, `airy`, `chief`.
 
@@ -184,7 +185,8 @@ class _Drawn:
         """
         if wave is None:
             rms = float(self.spots.polychromatic_rms[field])
-            far = _largest(np.linalg.norm(self.points[field], axis=-1))
+            counts = (self.spots.wavelength_weight > 0.0).numpy()
+            far = _largest(np.linalg.norm(self.points[field, counts], axis=-1))
         else:
             rms = float(self.spots.rms[field, wave])
             far = 1e3 * float(self.spots.geo[field, wave])

@@ -180,7 +180,7 @@ def _indices(lens: Lens) -> list[list[float]]:
 def _effect(before: Lens, after: Lens) -> str:
     """Say what the changes do to the focal length and to the place of the image."""
     wavelength = before.primary_wavelength
-    first, second = before.first_order(wavelength), after.first_order(wavelength)
+    first, second = (lens.first_order(wavelength, meridian="y") for lens in (before, after))
     return (
         f"the focal length at {wavelength:g} nm is {float(second.efl):.6g} mm and was "
         f"{float(first.efl):.6g} mm; the back focal distance is {float(second.bfd):.6g} mm and was "

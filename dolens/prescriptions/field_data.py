@@ -1,5 +1,6 @@
 """Fields of a prescription: points of the object or of the image, their weights and vignetting."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -77,6 +78,21 @@ def weights_from(value: Any, count: int, place: str) -> list[float]:
     if min(found) < 0.0 or not any(found):
         raise InputError(f"{place} must not be negative, and not all zero")
     return found
+
+
+def unequal_weights(values: Sequence[float], count: int, place: str) -> list[float] | None:
+    """Return the weights that a file gives its first `count` wavelengths or fields; None where it
+    gives none, or all are the same.
+
+    Raises:
+        InputError: too few, a negative one, or zeros alone; the message begins with the place.
+    """
+    if not values:
+        return None
+    if len(values) < count:
+        raise InputError(f"{place} gives {len(values)} weights for {count}")
+    found = weights_from(list(values[:count]), count, place)
+    return found if len(set(found)) > 1 else None
 
 
 def field_rows(fields: Fields) -> dict[str, Any]:

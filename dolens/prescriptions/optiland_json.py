@@ -12,6 +12,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.json_values import difference, mapping, number, require_unset, rows
 from dolens.prescriptions.optiland_apertures import aperture_row
 from dolens.prescriptions.read_file import ReadPrescription
@@ -175,7 +176,8 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
     if not values:
         return {}
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}
-    return found | ({"wavelength_weights": weights} if len(set(weights)) > 1 else {})
+    weighed = unequal_weights(weights, len(values), f"{where}: weights of the wavelengths")
+    return found | ({"wavelength_weights": weighed} if weighed else {})
 
 
 def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -202,8 +204,9 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     if any(any(pair) for pair in cut):
         found["vignetting"] = [{"compression_x": x, "compression_y": y} for x, y in cut]
     weights = [number(e, "weight", where, 1.0) for e in entries]
-    if len(set(weights)) > 1:
-        found["weights"] = weights
+    weighed = unequal_weights(weights, len(points), f"{where}: weights of the fields")
+    if weighed:
+        found["weights"] = weighed
     return {"fields": found}
 
 

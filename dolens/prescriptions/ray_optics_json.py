@@ -12,6 +12,7 @@ from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import radius_of
+from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.json_values import mapping, number, require_unset, rows
 from dolens.prescriptions.read_file import ReadPrescription
 
@@ -179,8 +180,9 @@ def _specification(model: dict[str, Any], finite: bool, where: str) -> dict[str,
         raise InputError(f"{where}: 'reference_wvl' {reference!r} is none of the wavelengths")
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": values[reference]}
     weights = [as_number(v, f"{where}: weights") for v in _array(waves.get("spectral_wts") or [])]
-    if len(set(weights)) > 1 and len(weights) == len(values):
-        found["wavelength_weights"] = weights
+    weighed = unequal_weights(weights, len(values), f"{where}: 'spectral_wts'")
+    if weighed:
+        found["wavelength_weights"] = weighed
     found |= _fields(_object(spec.get("field_of_view"), f"{where}: 'field_of_view'"), where)
     found |= _pupil(_object(spec.get("pupil"), f"{where}: 'pupil'"), finite, where)
     focus = spec.get("defocus")
@@ -216,8 +218,9 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     if any(any(row.values()) for row in cut):
         found["vignetting"] = cut
     weights = [number(f, "wt", where, 1.0) for f in entries]
-    if len(set(weights)) > 1:
-        found["weights"] = weights
+    weighed = unequal_weights(weights, len(entries), f"{where}: weights of the fields")
+    if weighed:
+        found["weights"] = weighed
     return {"fields": found}
 
 

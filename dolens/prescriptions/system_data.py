@@ -40,6 +40,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
@@ -65,6 +66,8 @@ SYSTEM_DATA_KEYS = (
 )
 # A stop's image so many object distances away counts as infinitely far.
 _TELECENTRIC = 1e4
+# Files round semi-diameters: a stop that is smaller by less is what its aperture asks for.
+_ROUNDED = 1e-4
 # Stands for a stop's semi-diameter (mm) until the pupil decides: within any surface's sag branch.
 _UNDECIDED = 1e-6
 
@@ -86,6 +89,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
         if not isinstance(wavelengths, list | tuple) or not wavelengths:
             raise InputError(f"{where}: 'wavelengths' must be a list of wavelengths in nm")
         wavelengths = [as_positive(w, f"{where}: 'wavelengths'") for w in wavelengths]
+        require_wavelengths(wavelengths, f"{where}: 'wavelengths'")
     reference = prescription.get("reference_wavelength")
     if reference is not None:
         reference = as_positive(reference, f"{where}: 'reference_wavelength'")
@@ -189,6 +193,11 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
     aperture = surface.aperture
     limited = given is not None and aperture.clips
     size = min(needed, as_number(given, "'semi_diameter'")) if limited else needed
+    if size < needed * (1.0 - _ROUNDED):
+        lens.stop_note = (
+            f"'{key}' {target:g} asks for a stop of semi-diameter {needed:.5g} mm, and the clear "
+            f"aperture of surface {lens.stop} has {size:.5g} mm: that is what these numbers are of."
+        )
     edge, window = Circle(size), aperture.window
     if not isinstance(aperture.edge, Circle | Unlimited):
         # The pupil is a circle, and the stop's own outline may take light away from it.
@@ -203,10 +212,12 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
 
 @torch.no_grad()
 def _stop_for(key: str, target: float, lens: Lens) -> float:
-    """Return the semi-diameter (mm) of the stop that makes a pupil."""
+    """Return the semi-diameter (mm) of the stop that makes a pupil in the y-z section, which is
+    what pupils and F-numbers are of in Zemax, CODE V, OSLO, Optiland and ray-optics too.
+    """
     wavelength, distance = lens.primary_wavelength, lens.object_distance
     if key == "object_na":
-        system = lens.system()
+        system = lens.system().section("y")
         n = float(lens.materials[0].index(wavelength))
         if target >= n:
             raise InputError(f"'object_na' must be below the index {n:g} of the object's medium")
@@ -215,7 +226,7 @@ def _stop_for(key: str, target: float, lens: Lens) -> float:
         away = float(distance or 0.0)  # it is given with an aperture of the object's side
         return abs(float(matrix[0, 0]) * away + float(matrix[0, 1]) * n) * slope
     size = lens.surfaces[str(lens.stop)].semi_diameter
-    first = lens.first_order(wavelength, distance)
+    first = lens.first_order(wavelength, distance, "y")
     if key == "working_f_number":
         return size * abs(float(first.working_f_number)) / target
     if key == "f_number":

@@ -27,7 +27,7 @@ from dolens.prescriptions.zemax_settings import apply_setting
 Read = Callable[[ZemaxFile], dict[str, Any]]
 
 TITLE = "LTTL"
-# What bends no ray: remarks, weights, mechanical sizes.
+# What bends no ray: remarks, weights of configurations, mechanical sizes.
 _SILENT = ("MOFF", "MCOM", TITLE, "CWGT", "CHZN", "MCSD", "CSUM", "HOLD")
 # Solves of a surface, whose results hold for the current configuration.
 _SOLVES = (
@@ -36,7 +36,8 @@ _SOLVES = (
 )
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 # Keys of a prescription that a state may have for itself.
-_KEYS = ("fields", "object_distance", "wavelengths", "reference_wavelength", *PUPIL_KEYS)
+_WAVES = ("wavelengths", "wavelength_weights", "reference_wavelength")
+_KEYS = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS)
 
 
 def configuration_lines(file: ZemaxFile) -> list[Line]:
@@ -185,6 +186,8 @@ def _states(
                 state[key] = there[key]
             elif key == "object_distance":
                 state[key] = float("inf")
+            elif key == "wavelength_weights":
+                state[key] = [1.0] * len(there["wavelengths"])
         found[number] = state
     return found
 

@@ -14,6 +14,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.fields import Vignetting
 from dolens.prescriptions.decimals import number_in_text, scaled
+from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.zemax import Line, ZemaxFile
 
 _ANGLES, _HEIGHTS = 0, 1
@@ -62,7 +63,8 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
     if n not in numbers:
         raise InputError(f"{where}: PWAV {n} is none of the wavelengths 1 to {len(numbers)}")
     found = {"wavelengths": values, "reference_wavelength": values[numbers.index(n)]}
-    return found | ({"wavelength_weights": weights} if len(set(weights)) > 1 else {})
+    weighed = unequal_weights(weights, len(values), f"{where}: weights of the wavelengths")
+    return found | ({"wavelength_weights": weighed} if weighed else {})
 
 
 def read_fields(
@@ -107,9 +109,9 @@ def read_fields(
     elif number == _ANGLES and finite_object:
         kind = FIELD_KINDS[_HEIGHTS]
     fields: dict[str, Any] = {kind: [list(point) for point in zip(x, y, strict=True)]}
-    weights = (weights + [1.0] * used)[:used]
-    if len(set(weights)) > 1:
-        fields["weights"] = weights
+    weighed = unequal_weights(weights + [1.0] * used, used, f"{where}: weights of the fields")
+    if weighed:
+        fields["weights"] = weighed
     rows = [
         {
             name: values[n]

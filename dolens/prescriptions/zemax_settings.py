@@ -24,6 +24,11 @@ OF_FIELDS = {
     "FVCY": ("VCYN", "ZVCY"),
     "FVAN": ("VANN", "ZVAN"),
 }
+# Operand → which argument of WAVM it is, and lists of older files, one number a wavelength.
+OF_WAVELENGTHS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "WAVE": (1, ("WAVL", "WAVN")),
+    "WLWT": (2, ("WWGT", "WWGN")),
+}
 _PUPILS = ("OBNA", "ENPD", "FNUM")
 _AIR = ("TEMP", "PRES")
 _PARAMETER = re.compile(r"PAR(\d)")
@@ -57,15 +62,14 @@ def apply_setting(file: ZemaxFile, line: Line) -> None:
             raise InputError(f"{operand} {at} has no place in the lists of fields")
         for name in lists:
             _replace(file.system, name, at - 1, value)
-    elif operand == "WAVE":
+    elif operand in OF_WAVELENGTHS:
+        place, lists = OF_WAVELENGTHS[operand]
         lines = file.system.get("WAVM", [])
-        lines[:] = [
-            one._replace(arguments=[one.arguments[0], value, *one.arguments[2:]])
-            if one.arguments[:1] == [str(at)]
-            else one
-            for one in lines
-        ]
-        for name in ("WAVL", "WAVN"):
+        for n, one in enumerate(lines):
+            if one.arguments[:1] == [str(at)]:
+                words = [*one.arguments, "1"][:3]
+                lines[n] = one._replace(arguments=[*words[:place], value, *words[place + 1 :]])
+        for name in lists:
             if name in file.system and len(file.system[name][-1].arguments) >= at:
                 _replace(file.system, name, at - 1, value)
     elif operand == "APER":

@@ -12,7 +12,12 @@ from dolens.errors import InputError
 from dolens.prescriptions.states import merged_prescription
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_configurations import TITLE, own_title
-from dolens.prescriptions.zemax_settings import OF_APERTURES, OF_FIELDS, OF_SURFACES
+from dolens.prescriptions.zemax_settings import (
+    OF_APERTURES,
+    OF_FIELDS,
+    OF_SURFACES,
+    OF_WAVELENGTHS,
+)
 
 _BY_LINE = {line: operand for operand, line in OF_SURFACES.items()}
 _BY_PLACE = {place: operand for operand, place in OF_APERTURES.items()}
@@ -97,10 +102,9 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
             # As many in both, or FTYP differs.
             pairs = zip(base.system[operand], file.system.get(operand, []), strict=False)
             for one, other in pairs:
-                if one.arguments[2:] != other.arguments[2:]:
-                    raise InputError(f"{place}: a .zmx file has one set of wavelength weights")
-                if one.arguments[1] != other.arguments[1]:
-                    found[Setting("WAVE", int(one.arguments[0]))] = other.arguments[1]
+                for name, (at, _) in OF_WAVELENGTHS.items():
+                    if one.arguments[at] != other.arguments[at]:
+                        found[Setting(name, int(one.arguments[0]))] = other.arguments[at]
         elif before == after:
             continue
         elif operand in _BY_LIST and len(before) == len(after):
@@ -169,8 +173,9 @@ def _settings_of(file: ZemaxFile, settings: Mapping[Setting, None]) -> dict[Sett
             found[setting] = _last(file.surfaces[n], kind)[at]
         elif operand in OF_FIELDS:
             found[setting] = _last(file.system, OF_FIELDS[operand][0])[n - 1]
-        elif operand == "WAVE":
-            found[setting] = file.system["WAVM"][n - 1].arguments[1]
+        elif operand in OF_WAVELENGTHS:
+            at, _ = OF_WAVELENGTHS[operand]
+            found[setting] = file.system["WAVM"][n - 1].arguments[at]
         else:
             pupil = next(name for name in ("ENPD", "FNUM", "OBNA") if name in file.system)
             found[setting] = _last(file.system, pupil)[0]

@@ -70,17 +70,24 @@ def usual_tolerances_text(lens: Lens) -> str:
     )
 
 
-def fields_all_around(fields: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
-    """Return fields on all four sides of the axis: a perturbed lens has no symmetry.
+def fields_all_around(
+    fields: Sequence[Sequence[float]], weights: Sequence[float]
+) -> dict[tuple[float, float], float]:
+    """Return fields on all four sides of the axis, with their weights: a perturbed lens has no
+    symmetry.
+
+    Each of the given fields hands its weight on in equal parts: the axis to one, others to four.
 
     Args:
         fields: (x, y) of each, degrees or mm.
+        weights: of each.
     """
-    found: dict[tuple[float, float], None] = {}
-    for x, y in fields:
+    found: dict[tuple[float, float], float] = {}
+    for (x, y), weight in zip(fields, weights, strict=True):
         for point in ((x, y), (-x, -y), (y, -x), (-y, x)):
-            found[(point[0] + 0.0, point[1] + 0.0)] = None
-    return list(found)
+            there = (point[0] + 0.0, point[1] + 0.0)
+            found[there] = found.get(there, 0.0) + 0.25 * weight
+    return {point: weight for point, weight in found.items() if weight > 0.0}
 
 
 def _length(lens: Lens) -> float:

@@ -48,12 +48,16 @@ _STEEP = 10.0
 @torch.no_grad()
 def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
     """Return the spots of a lens, with the RMS radii of `rms_spot_um` (mm)."""
-    fields, waves = settings.fields_of(lens), settings.wavelengths_of(lens)
+    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
+    waves = wavelengths.tolist()
     quality, values, hits = _traced(lens, settings)
     shape = (len(fields), len(waves))
     rms = values.rms.double().cpu().reshape(shape)
     if not is_grid(settings):
-        found = spot_diagram(lens, fields, waves, object_distance=lens.object_distance)
+        distance = lens.object_distance
+        found = spot_diagram(
+            lens, fields, waves, object_distance=distance, wavelength_weights=shares
+        )
         return replace(found, rms=rms)
     spot = quality.spots.spot.cpu()
     points = _padded(hits, spot, quality.spots.count).unflatten(0, shape)
@@ -61,8 +65,8 @@ def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
     light = valid.double()
     extent = values.deviations.double().cpu().norm(dim=1, keepdim=True)
     geo = _padded(extent, spot, quality.spots.count).nan_to_num(0.0).amax((1, 2))
-    common, square = moments(points.flatten(1, 2), light.flatten(1, 2))
-    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
+    every = light * shares[:, None]
+    common, square = moments(points.flatten(1, 2), every.flatten(1, 2))
     chief = lens.chief_ray(
         torch.tensor(list(fields), dtype=lens.dtype, device=lens.device), lens.primary_wavelength
     )
@@ -74,7 +78,7 @@ def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
         intercepts=points,
         valid=valid,
         weight=torch.full((points.shape[2],), 1.0 / points.shape[2], dtype=torch.float64),
-        wavelength_weight=torch.full((len(wavelengths),), 1.0 / len(wavelengths)).double(),
+        wavelength_weight=shares,
         chief=lens.trace(chief).position[..., :2].double().cpu(),
         centroid=moments(points, light)[0],
         rms=rms,
@@ -99,24 +103,30 @@ def merit_modulation(
     Returns:
         The MTF, and labels of the fields that are such products.
     """
-    fields, waves = settings.fields_of(lens), settings.wavelengths_of(lens)
+    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
     distance = lens.object_distance
     if pupil_share(lens, settings) < 1.0:
         found = _grid_modulation(lens, settings, frequencies)
         return found, [field_label(field, found.field_unit) for field in found.fields]
-    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
     numbers = working_f_numbers(lens, wavelengths, distance)
-    limit = diffraction_limited_transfer(frequencies, wavelengths[:, None], numbers[:, None]).mean(
-        0
+    limit = shares @ diffraction_limited_transfer(
+        frequencies, wavelengths[:, None], numbers[:, None]
     )
-    airy = float(AIRY * 1e-3 * (wavelengths * numbers).mean())
+    airy = float(AIRY * 1e-3 * shares @ (wavelengths * numbers))
     if spot_table(lens, settings).mean > _STEEP * airy:
         # Diffraction changes next to nothing, and a wave calculation takes long.
-        rays = modulation(lens, fields, waves, frequencies, object_distance=distance)
+        rays = modulation(
+            lens,
+            fields,
+            wavelengths,
+            frequencies,
+            object_distance=distance,
+            wavelength_weights=shares,
+        )
         products = {"tangential": rays.tangential * limit, "sagittal": rays.sagittal * limit}
         labels = [field_label(field, rays.field_unit) for field in rays.fields]
         return replace(rays, **products, diffraction_limit=limit), labels
-    whole = diffraction_modulation(lens, fields, waves, frequencies, distance)
+    whole = diffraction_modulation(lens, fields, wavelengths, frequencies, distance, shares)
     by_rays = [not done for done in whole.diffraction]
     factor = torch.where(torch.tensor(by_rays)[:, None], limit, 1.0)
     found = Modulation(
@@ -137,15 +147,14 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
 
     The grid is denser than that of `rms_spot_um`, and as large.
     """
-    fields, waves = settings.fields_of(lens), settings.wavelengths_of(lens)
+    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
     dense = {**settings.sampling_options, "count": _DENSE_GRID}
     quality, _, hits = _traced(lens, replace(settings, sampling_options=dense))
     points = _padded(hits, quality.spots.spot.cpu(), quality.spots.count)
-    points = points.unflatten(0, (len(fields), len(waves))).flatten(1, 2)
-    light = points.isfinite().all(-1).double()
-    points = points.nan_to_num(0.0)
+    points = points.unflatten(0, (len(fields), len(wavelengths)))
+    light = (points.isfinite().all(-1) * shares[:, None]).flatten(1, 2)
+    points = points.flatten(1, 2).nan_to_num(0.0)
     field = torch.tensor([tuple(one) for one in fields], dtype=torch.float64)
-    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
     along = field_directions(field, lens.object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
     tangential, sagittal = (
@@ -157,7 +166,8 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
         )
         for way in (along, across)
     )
-    limit = _square_limit(pupil_f_numbers(lens, settings, wavelengths), wavelengths, frequencies)
+    numbers = pupil_f_numbers(lens, settings, wavelengths)
+    limit = shares @ _square_limits(numbers, wavelengths, frequencies)
     unit = field_unit(lens.object_distance)
     return Modulation(
         field, unit, wavelengths, frequencies, tangential * limit, sagittal * limit, limit
@@ -180,16 +190,17 @@ def merit_rms_against_field(
     """
     steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64).tolist()
     fields = [tuple(a + s * (b - a) for a, b in zip(start, edge, strict=True)) for s in steps]
-    return _curves(lens, settings, fields, settings.wavelengths_of(lens))
+    return _curves(lens, settings, fields, *settings.spectrum_of(lens))
 
 
 def merit_rms_against_wavelength(
     lens: Lens, settings: MeritSettings, interval: tuple[float, float]
 ) -> RMSCurves:
     """Return RMS radii over wavelengths, each about its own centroid or chief ray."""
-    waves = torch.linspace(*interval, _CURVE_POINTS, dtype=torch.float64).tolist()
+    waves = torch.linspace(*interval, _CURVE_POINTS, dtype=torch.float64)
     own = replace(settings, reference_spectrum="monochromatic")
-    return _curves(lens, own, list(settings.fields_of(lens)), waves)
+    alike = torch.full_like(waves, 1.0 / len(waves))
+    return _curves(lens, own, settings.fields_of(lens), waves, alike)
 
 
 @torch.no_grad()
@@ -197,15 +208,15 @@ def _curves(
     lens: Lens,
     settings: MeritSettings,
     fields: Sequence[Sequence[float]],
-    waves: Sequence[float],
+    wavelengths: Tensor,
+    shares: Tensor,
 ) -> RMSCurves:
-    own = replace(settings, wavelengths=list(waves), field_weights=None, wavelength_weights=None)
+    own = replace(settings, wavelengths=wavelengths.tolist(), wavelength_weights=shares.tolist())
     try:
         rms, together = _radii(lens, own, fields)
     except InputError:  # no light of some field passes
         rows = [_radii_or_none(lens, own, field) for field in fields]
         rms, together = (torch.cat(part) for part in zip(*rows, strict=True))
-    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
     return RMSCurves(
         fields=torch.tensor([tuple(field) for field in fields], dtype=torch.float64),
         field_unit=field_unit(lens.object_distance),
@@ -220,12 +231,14 @@ def _radii(
     lens: Lens, settings: MeritSettings, fields: Sequence[Sequence[float]]
 ) -> tuple[Tensor, Tensor]:
     """Return RMS radii (F, W), and those of all wavelengths about their common reference, (F,)."""
-    settings = replace(settings, fields=[tuple(field) for field in fields])
+    alike = [1.0] * len(fields)
+    settings = replace(settings, fields=[tuple(field) for field in fields], field_weights=alike)
     quality = settings.image_quality(lens)
-    shape = (len(fields), len(settings.wavelengths_of(lens)))
+    _, shares = settings.spectrum_of(lens)
+    shape = (len(fields), len(shares))
     rms = quality.values(lens).rms.double().cpu().reshape(shape)
     common = replace(quality, reference_spectrum="polychromatic").values(lens)
-    return rms, common.mean_squares.double().cpu().reshape(shape).mean(-1).sqrt()
+    return rms, (common.mean_squares.double().cpu().reshape(shape) @ shares).sqrt()
 
 
 def _radii_or_none(
@@ -252,10 +265,11 @@ def _padded(hits: Tensor, spot: Tensor, count: int) -> Tensor:
     return torch.nn.utils.rnn.pad_sequence(of_spot, batch_first=True, padding_value=math.nan)
 
 
-def _square_limit(f_numbers: Tensor, wavelengths: Tensor, frequencies: Tensor) -> Tensor:
-    """Return the diffraction limit (Q,) of a square pupil, 1 - ν·λ·N with N over its whole width.
+def _square_limits(f_numbers: Tensor, wavelengths: Tensor, frequencies: Tensor) -> Tensor:
+    """Return the diffraction limits (W, Q) of a square pupil, 1 - ν·λ·N with N over its whole
+    width.
 
-    Goodman, Introduction to Fourier Optics, section 6.4; the mean over the wavelengths.
+    Goodman, Introduction to Fourier Optics, section 6.4.
     """
     s = frequencies * (wavelengths * 1e-6 * f_numbers)[:, None]
-    return (1.0 - s).clamp(min=0.0).mean(0)
+    return (1.0 - s).clamp(min=0.0)

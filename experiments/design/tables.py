@@ -26,7 +26,7 @@ class SpotTable:
     Attributes:
         radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
         mean: of all, with the merit's weights.
-        light: share of the beams that passes, mean of all; see `SpotRays.light`.
+        light: share of the beams that passes, likewise; see `SpotRays.light`.
     """
 
     radii: dict[str, float]
@@ -47,8 +47,9 @@ def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> Spot
     quality = settings.image_quality(lens)
     rms = 1e3 * quality.values(lens).rms
     mean = float((quality.weights.to(rms) * rms).sum())
+    light = float((quality.weights.to(quality.spots.light) * quality.spots.light).sum())
     radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
-    return SpotTable(radii, mean, float(quality.spots.light.mean()))
+    return SpotTable(radii, mean, light)
 
 
 def spot_metrics(

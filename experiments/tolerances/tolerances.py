@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from dolens.analysis.conditions import field_shares
+from dolens.analysis.fields_and_wavelengths import spectral_shares
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count, numbers_of
@@ -77,7 +79,8 @@ class TolerancesModule(Analysis):
         experiment: name of the experiment.
         folder: where tables go.
         spots: by which a lens is judged.
-        weights: of the spots' fields; None: equal.
+        weights: of the spots' fields; None: the lens's own where the fields are, else equal.  Those
+            of wavelengths are the lens's own where they are, else equal.
         tolerances: see `tolerances_from`.
         tolerance_factor: multiplies every half-range.
         monte_carlo: the lenses drawn.
@@ -233,9 +236,11 @@ class TolerancesModule(Analysis):
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
-        """Return weights of spots (S,) from those of fields; all wavelengths count alike."""
-        if weights is not None:
-            numbers = numbers_of("weights", weights, len(self.spots.fields))
-            weights = torch.tensor(numbers).double()
-            weights = weights.repeat_interleave(len(self.spots.wavelengths))
-        return spot_weights(weights, len(self.spots))
+        """Return weights of spots (S,) from those of fields and the lens's own of wavelengths."""
+        fields = torch.tensor(self.spots.fields, dtype=torch.float64)
+        if weights is None:
+            of_fields = field_shares(self.lens, fields)
+        else:
+            of_fields = fields.new_tensor(numbers_of("weights", weights, len(fields)))
+        of_waves = spectral_shares(self.lens, self.spots.wavelengths)
+        return spot_weights(torch.outer(of_fields, of_waves).flatten(), len(self.spots))

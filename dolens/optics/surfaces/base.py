@@ -193,6 +193,16 @@ class Surface(nn.Module):
         return _derivative(slope)(origin).mean()
 
     @classmethod
+    def section_curvature(
+        cls, p: Parameters, cosine: Tensor | float, sine: Tensor | float
+    ) -> Tensor | float:
+        """Return the curvature at the vertex (1/mm) of the section along (cosine, sine): from the
+        derivative of the slope, for any sag.
+        """
+        slope, origin = cls._slope_along(p, cosine, sine)
+        return _derivative(slope)(origin)
+
+    @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
         """Return the coefficient G (1/mm³) of r⁴ in the sag beyond the osculating sphere, c·r²/2 +
         c³·r⁴/8.
@@ -211,13 +221,20 @@ class Surface(nn.Module):
         """Return the slope along three azimuths 60° apart at distances r (3,), and zero r."""
         like = next(iter(p.values()))
         azimuth = torch.arange(3, dtype=like.dtype, device=like.device) * (math.pi / 3.0)
-        cosine, sine = torch.cos(azimuth), torch.sin(azimuth)
+        slope, _ = cls._slope_along(p, torch.cos(azimuth), torch.sin(azimuth))
+        return slope, torch.zeros_like(azimuth)
+
+    @classmethod
+    def _slope_along(
+        cls, p: Parameters, cosine: Tensor | float, sine: Tensor | float
+    ) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+        """Return the slope along directions (cosine, sine) at distances r, and zero r."""
 
         def slope(r: Tensor) -> Tensor:
             _, sx, sy, _ = cls.sag_and_gradient(p, r * cosine, r * sine)
             return sx * cosine + sy * sine
 
-        return slope, torch.zeros_like(azimuth)
+        return slope, next(iter(p.values())).new_zeros(())
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:

@@ -120,6 +120,11 @@ class Law(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    def section_power(cls, p: Parameters, cosine: Number, sine: Number) -> ParaxialPower:
+        """Return what the law adds to the power along (cosine, sine); here: the mean."""
+        return cls.paraxial_power(p)
+
+    @classmethod
     def fourth_order_path(cls, p: Parameters) -> Number:
         """Return the coefficient of r⁴ in the path that the law adds, over the wavelength: 1/(mm³
         nm); the mean over azimuth.

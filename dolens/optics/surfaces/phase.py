@@ -313,6 +313,13 @@ class XYPhase(Phase):
         return ParaxialPower(0.0, -2.0 * _PATH * p["order"] * square / p["norm_radius"] ** 2)
 
     @classmethod
+    def section_power(cls, p: Parameters, cosine: Number, sine: Number) -> ParaxialPower:
+        """Return -2·(the coefficient of r² in the path along the section)."""
+        x2, xy, y2 = (p.get(name, 0.0) for name in ("x2", "xy", "y2"))
+        square = x2 * cosine * cosine + xy * cosine * sine + y2 * sine * sine
+        return ParaxialPower(0.0, -2.0 * _PATH * p["order"] * square / p["norm_radius"] ** 2)
+
+    @classmethod
     def fourth_order_path(cls, p: Parameters) -> Number:
         """Return the mean over azimuth, (3·x4 + x2y2 + 3·y4)/8.
 

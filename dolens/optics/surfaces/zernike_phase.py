@@ -100,6 +100,11 @@ class ZernikePhase(Phase):
         return XYPhase.paraxial_power(cls.as_xy(p))
 
     @classmethod
+    def section_power(cls, p: Parameters, cosine: Number, sine: Number) -> ParaxialPower:
+        """Return that of the same phase as a polynomial."""
+        return XYPhase.section_power(cls.as_xy(p), cosine, sine)
+
+    @classmethod
     def fourth_order_path(cls, p: Parameters) -> Number:
         """Return the mean over azimuth of the coefficient of r⁴ in the path.
 

@@ -8,6 +8,7 @@ from dolens.errors import InputError
 from dolens.prescriptions.codev.file import CodeVFile
 from dolens.prescriptions.codev.text import Command, unquoted
 from dolens.prescriptions.decimals import exact, nearest, number_in_text, scaled
+from dolens.prescriptions.field_data import unequal_weights
 
 _UNITS = {"M": Fraction(1), "C": Fraction(10), "I": Fraction(127, 5)}
 _FIELDS = {
@@ -69,9 +70,11 @@ def _wavelengths(file: CodeVFile, where: str) -> dict[str, Any]:
     if not 1 <= number <= len(values):
         raise InputError(f"{where}: REF {number} is none of the wavelengths 1 to {len(values)}")
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": values[number - 1]}
-    weights = _numbers(file, "WTW", Fraction(1), where)
-    if len(set(weights)) > 1:
-        found["wavelength_weights"] = _as_many(weights, len(values), "WTW", where)
+    weights = unequal_weights(
+        _numbers(file, "WTW", Fraction(1), where), len(values), f"{where}: WTW"
+    )
+    if weights:
+        found["wavelength_weights"] = weights
     return found
 
 
@@ -89,9 +92,9 @@ def _fields(file: CodeVFile, factor: Fraction, where: str) -> dict[str, Any]:
     count = max(len(x), len(y))
     x, y = (values + [0.0] * (count - len(values)) for values in (x, y))
     fields: dict[str, Any] = {_FIELDS[kind]: [[x[i], y[i]] for i in range(count)]}
-    weights = _numbers(file, "WTF", Fraction(1), where)
-    if len(set(weights)) > 1:
-        fields["weights"] = _as_many(weights, count, "WTF", where)
+    weights = unequal_weights(_numbers(file, "WTF", Fraction(1), where), count, f"{where}: WTF")
+    if weights:
+        fields["weights"] = weights
     vignetting = _vignetting(file, count, where)
     if vignetting:
         fields["vignetting"] = vignetting
@@ -160,12 +163,6 @@ def _surroundings(file: CodeVFile, where: str) -> dict[str, Any]:
     if pressure and _number(pressure, where, 1 / _ATMOSPHERE) != 1.0:
         found["pressure"] = _number(pressure, where, 1 / _ATMOSPHERE)
     return found
-
-
-def _as_many(values: list[float], count: int, key: str, where: str) -> list[float]:
-    if len(values) < count:
-        raise InputError(f"{where}: {key} gives {len(values)} weights for {count}")
-    return values[:count]
 
 
 def _numbers(file: CodeVFile, key: str, factor: Fraction, where: str) -> list[float]:

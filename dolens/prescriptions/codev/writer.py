@@ -125,7 +125,9 @@ def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
     a short text, so that the stop's size is what clips.
     """
     lens = lens_from_prescription(prescription, where=where).requires_grad_(False)
-    diameter = float(lens.first_order(lens.primary_wavelength).entrance_pupil.diameter)
+    diameter = float(
+        lens.first_order(lens.primary_wavelength, meridian="y").entrance_pupil.diameter
+    )
     if not math.isfinite(diameter) or diameter <= 0.0:
         raise InputError(
             f"{where}: a .seq file needs an aperture, and the stop of this lens has no entrance "

@@ -13,6 +13,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
 from dolens.prescriptions.decimals import exact, nearest, number_in_text, radius_of, scaled
+from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.oslo.text import POWERS, Line, OsloFile, parse_oslo
 from dolens.prescriptions.read_file import ReadPrescription
 
@@ -85,8 +86,9 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
         values = [scaled(word, _MICROMETRE, f"{where}: WV") for word in waves.words]
         found |= {"wavelengths": values, "reference_wavelength": values[0]}
         weights = [number_in_text(w, f"{where}: WW") for w in _words(file.system, "WW")]
-        if len(set(weights)) > 1 and len(weights) >= len(values):
-            found["wavelength_weights"] = weights[: len(values)]
+        weighed = unequal_weights(weights, len(values), f"{where}: WW")
+        if weighed:
+            found["wavelength_weights"] = weighed
     return found | _field(file, factor, finite, where) | _pupil(file, factor, finite, where)
 
 
