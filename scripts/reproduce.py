@@ -8,14 +8,15 @@ other names since then are translated, and each is named.
 """
 
 import argparse
-import json
 import subprocess
 import sys
 from pathlib import Path
 
-import yaml
-
+from dolens.errors import InputError
+from dolens.experiments.running.composition import with_overrides
+from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.renaming import translated
+from dolens.experiments.running.run_files import info_of, metrics_of, overrides_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -25,14 +26,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="the run folder to repeat")
     parser.add_argument("--into", type=Path, help="where the new run goes (default: beside it)")
+    parser.add_argument("--trust", action="store_true", help="let it call whatever it names")
     arguments = parser.parse_args()
     old = arguments.run.resolve()
-    for name in (".hydra/overrides.yaml", "run.json", "metrics.json"):
-        if not (old / name).is_file():
-            sys.exit(f"error: {old} is no finished run folder: {name} is missing")
+    try:
+        # Its overrides are composed once to see what they name, and nothing is made of that.
+        with_overrides(read_record(old, trust=arguments.trust), ["seed=0"])
+        overrides, expected = overrides_of(old), metrics_of(old)
+        commit = (info_of(old).get("git") or {}).get("commit")
+    except InputError as error:
+        sys.exit(f"error: {error}")
     into = (arguments.into or old.with_name(old.name + "_again")).resolve()
-    overrides = yaml.safe_load((old / ".hydra/overrides.yaml").read_text(encoding="utf-8"))
-    commit = json.loads((old / "run.json").read_text(encoding="utf-8"))["git"]["commit"]
     here = subprocess.run(
         ["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
     ).stdout.strip()
@@ -45,8 +49,7 @@ def main() -> int:
     done = subprocess.run(command, cwd=ROOT, check=False)
     if done.returncode:
         return done.returncode
-    expected = json.loads((old / "metrics.json").read_text(encoding="utf-8"))
-    found = json.loads((into / "metrics.json").read_text(encoding="utf-8"))
+    found = metrics_of(into)
     differing = 0
     for name, value in expected.items():
         if name.startswith("cost/"):

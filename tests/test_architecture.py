@@ -58,6 +58,7 @@ ALLOWED = {
 }
 # The command line stands above everything, the experiments too.
 ALLOWED["cli"] = {*ALLOWED, "experiments"}
+ALLOWED["__main__"] = {"cli"}
 
 # A lens's methods for notebooks are one-line ways to what the floors above compute and draw.  This
 # one folder may import them, inside functions only: tracing and training need none of them.

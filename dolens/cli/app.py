@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from dolens import __version__
 from dolens.cli.apply import apply
 from dolens.cli.check import check
 from dolens.cli.compare import compare
@@ -23,6 +22,7 @@ from dolens.cli.show import show
 from dolens.cli.threads import limit_threads
 from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError, one_line
+from dolens.packaged import installed_version
 from dolens.spinning import choose_waiting
 
 app = typer.Typer(
@@ -44,7 +44,7 @@ def main() -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"dolens {__version__}")
+        typer.echo(f"dolens {installed_version('dolens')}")
         raise typer.Exit
 
 

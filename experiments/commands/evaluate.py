@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
 
@@ -189,15 +188,15 @@ def _tested(
     set_threads(settings.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     set_matmul_precision(settings.matmul_precision)
-    with run.record.importable():
-        callbacks = [instantiate(c) for c in (settings.callbacks or {}).values() if c]
+    entries = (settings.callbacks or {}).items()
+    callbacks = [run.made(f"callbacks.{name}", entry) for name, entry in entries if entry]
     quiet_lightning()
     unwanted: tuple[type, ...] = (ModelCheckpoint,)
     if not settings.trainer.get("enable_progress_bar", True):
         unwanted = (ModelCheckpoint, ProgressBar)
     kept = [callback for callback in callbacks if not isinstance(callback, unwanted)]
-    trainer: lightning.Trainer = instantiate(
-        settings.trainer, callbacks=kept, logger=False, enable_checkpointing=False
+    trainer: lightning.Trainer = run.made(
+        "trainer", settings.trainer, callbacks=kept, logger=False, enable_checkpointing=False
     )
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))

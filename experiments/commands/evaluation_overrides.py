@@ -58,7 +58,8 @@ def with_own_calibration(record: RecordedRun, overrides: Sequence[str]) -> list[
     found, views = list(overrides), (record.config["module"] or {}).get("views")
     if not found or not isinstance(views, Mapping) or "psf_size" not in views:
         return found
-    depths = views.get("psf_depths") or views["scene"].get("depths")
+    scene = views.get("scene")
+    depths = views.get("psf_depths") or (scene.get("depths") if isinstance(scene, dict) else None)
     asked = any(text.lstrip("+").startswith("views.psf_depths=") for text in found)
     if depths is None or asked:
         return found

@@ -81,8 +81,24 @@ class FinishedRun:
         Raises:
             InputError: it cannot be made.
         """
-        with self.record.importable():
-            return _made("data", self.settings.data)
+        return self.made("data", self.settings.data)
+
+    def made(self, key: str, config: DictConfig, **more: Any) -> Any:
+        """Return what a part of the configuration makes.
+
+        Args:
+            key: of the part, for messages.
+            config: the part.
+            more: arguments besides.
+
+        Raises:
+            InputError: it cannot be made; one line that names the file.
+        """
+        try:
+            with self.record.importable():
+                return _made(key, config, **more)
+        except InputError as error:
+            raise InputError(f"{self.folder / RESOLVED}: {error}") from None
 
 
 def load_run(
@@ -177,7 +193,7 @@ def _loaded(
         cfg = OmegaConf.create(dict(config))
         settings = RunSettings.of(cfg)
         refuse_unknown_keys(config, ("module",))
-        refuse_wrong_types(config, ("module", "data", "callbacks", "trainer"))
+        refuse_wrong_types(config, ("module",))
         made_of = OmegaConf.create(_without_first_weights(config["module"], with_loss))
         with torch.random.fork_rng(devices=()):
             module = _module(made_of, _lens(settings.prescription(), settings))
@@ -185,7 +201,7 @@ def _loaded(
     except (InputError, OmegaConfBaseException) as error:
         where = f"; Python looks for classes in {Path.cwd()} and in the folders of PYTHONPATH"
         message = f"{record.folder / RESOLVED}: {one_line(error)}"
-        raise InputError(message + where * record.trusted) from None
+        raise InputError(message + (where if record.trusted else "")) from None
     file, state = None, {}
     if module.trains:
         file = checkpoint_file(record, checkpoint)
@@ -226,14 +242,14 @@ def _module(config: DictConfig, lens: Lens) -> Experiment:
         raise InputError(f"module: {type(error).__name__}: {one_line(error)}") from error
 
 
-def _made(key: str, config: DictConfig) -> Any:
-    """Return what a part of the configuration makes.
+def _made(key: str, config: DictConfig, **more: Any) -> Any:
+    """Return what a part of the configuration makes, with arguments besides.
 
     Raises:
         InputError: it cannot be made; one line with the reason.
     """
     try:
-        return instantiate(config)
+        return instantiate(config, **more)
     except HydraException as error:
         if isinstance(error.__cause__, InputError):
             raise error.__cause__ from None

@@ -7,8 +7,10 @@ import yaml
 
 from dolens import InputError
 from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.finished_run import load_run
 from dolens.experiments.running.training import run
 from dolens.optics.surfaces import SURFACES, unregister_surface
+from tests.experiments.conftest import finished_run
 
 CYLINDER = """
 import dolens
@@ -55,6 +57,17 @@ def test_a_lens_with_a_user_s_own_surface_is_designed(composed, module, tmp_path
     final = yaml.safe_load((tmp_path / "run" / "lens" / "final.yaml").read_text())
     assert final["surfaces"]["2"]["type"] == "cylinder"
     assert final["surfaces"]["2"]["curvature_x"] == pytest.approx(1e-4)
+
+
+def test_a_finished_run_with_a_module_of_one_s_own_needs_trust(root, module, tmp_path):
+    """Who loads it is told what it would import."""
+    folder = finished_run(root, tmp_path, *WITH_CYLINDER, f"extensions=[{module}]")
+    sys.modules.pop(module)
+    unregister_surface("cylinder")
+    with pytest.raises(InputError, match=rf"would import {module} \(extensions\); .* --trust"):
+        load_run(folder)
+    assert module not in sys.modules
+    assert load_run(folder, trust=True).lens.surfaces["2"].kind == "cylinder"
 
 
 def test_without_its_module_the_type_is_unknown(module, refused):
