@@ -9,6 +9,7 @@ wavelength.  Wavelengths are those in air, as of the spectral lines that makers 
 
 from collections.abc import Callable, Iterable
 
+import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -40,11 +41,25 @@ def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
 
 
 def require_wavelength(wavelength: float | Tensor) -> None:
-    """Raise `InputError` where a wavelength that is a number is none of light; a tensor's are not
-    looked at, which would wait for its device.
+    """Raise `InputError` where a wavelength, or one of a tensor on the CPU, is none of light; on
+    another device that would wait for it.
     """
+    if not (isinstance(wavelength, Tensor) and wavelength.is_cuda):
+        require_wavelengths(extremes(wavelength))
+
+
+def extremes(wavelength: float | Tensor) -> list[float]:
+    """Shortest and longest wavelength, or nothing where they cannot be looked at."""
     if not isinstance(wavelength, Tensor):
-        require_wavelengths([wavelength])
+        return [wavelength]
+    if torch.compiler.is_compiling() or wavelength.numel() == 0 or wavelength.is_meta:
+        return []
+    if wavelength.is_cuda and torch.cuda.is_current_stream_capturing():
+        return []
+    # The values beneath vmap and the like: read once, and never part of the result.
+    plain = torch.func.debug_unwrap(wavelength.detach(), recurse=True)
+    # What is computed from them within vjp is wrapped again: PyTorch 2.9 gives no list of it.
+    return [value.item() for value in torch.aminmax(plain)]
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
