@@ -20,12 +20,12 @@ Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
-# nm: from the vacuum ultraviolet to the far infrared.  What lies beyond is another unit, µm or m.
-SHORTEST, LONGEST = 50.0, 1e5
+# nm: from the vacuum ultraviolet to millimetre waves, which telescopes of them have.  What lies beyond is another unit, µm or m.
+SHORTEST, LONGEST = 50.0, 1e7
 
 
 def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
-    """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 100 µm.
+    """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 10 mm.
 
     Args:
         wavelengths: nm.
@@ -35,7 +35,7 @@ def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
         if not SHORTEST <= wavelength <= LONGEST:
             before = f"{where}: " if where else ""
             raise InputError(
-                f"{before}wavelength {wavelength:g} nm: allowed: {SHORTEST:g} to {LONGEST:g} nm "
+                f"{before}wavelength {wavelength:g} nm: allowed: 50 nm to 10 mm "
                 "(wavelengths are in nm, so 0.55 µm is 550)"
             )
 
