@@ -20,7 +20,7 @@ Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
-# nm: from the vacuum ultraviolet to millimetre waves, which telescopes of them have.  What lies beyond is another unit, µm or m.
+# nm: from the vacuum ultraviolet to millimetre waves; what lies beyond is another unit, µm or m.
 SHORTEST, LONGEST = 50.0, 1e7
 
 
