@@ -9,6 +9,7 @@ wavelength.  Wavelengths are those in air, as of the spectral lines that makers 
 
 from collections.abc import Callable, Iterable
 
+import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -19,12 +20,12 @@ Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
-# nm: from the vacuum ultraviolet to the far infrared.  What lies beyond is another unit, µm or m.
-SHORTEST, LONGEST = 50.0, 1e5
+# nm: from the vacuum ultraviolet to millimetre waves; what lies beyond is another unit, µm or m.
+SHORTEST, LONGEST = 50.0, 1e7
 
 
 def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
-    """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 100 µm.
+    """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 10 mm.
 
     Args:
         wavelengths: nm.
@@ -34,17 +35,31 @@ def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
         if not SHORTEST <= wavelength <= LONGEST:
             before = f"{where}: " if where else ""
             raise InputError(
-                f"{before}wavelength {wavelength:g} nm: allowed: {SHORTEST:g} to {LONGEST:g} nm "
+                f"{before}wavelength {wavelength:g} nm: allowed: 50 nm to 10 mm "
                 "(wavelengths are in nm, so 0.55 µm is 550)"
             )
 
 
 def require_wavelength(wavelength: float | Tensor) -> None:
-    """Raise `InputError` where a wavelength that is a number is none of light; a tensor's are not
-    looked at, which would wait for its device.
+    """Raise `InputError` where a wavelength, or one of a tensor on the CPU, is none of light; on
+    another device that would wait for it.
     """
+    if not (isinstance(wavelength, Tensor) and wavelength.is_cuda):
+        require_wavelengths(extremes(wavelength))
+
+
+def extremes(wavelength: float | Tensor) -> list[float]:
+    """Shortest and longest wavelength, or nothing where they cannot be looked at."""
     if not isinstance(wavelength, Tensor):
-        require_wavelengths([wavelength])
+        return [wavelength]
+    if torch.compiler.is_compiling() or wavelength.numel() == 0 or wavelength.is_meta:
+        return []
+    if wavelength.is_cuda and torch.cuda.is_current_stream_capturing():
+        return []
+    # The values beneath vmap and the like: read once, and never part of the result.
+    plain = torch.func.debug_unwrap(wavelength.detach(), recurse=True)
+    # What is computed from them within vjp is wrapped again: PyTorch 2.9 gives no list of it.
+    return [value.item() for value in torch.aminmax(plain)]
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:

@@ -3,11 +3,10 @@
 import math
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.dispersion import Formula, Terms
+from dolens.optics.dispersion import Formula, Terms, extremes
 from dolens.optics.thermal import (
     STANDARD_PRESSURE,
     STANDARD_TEMPERATURE,
@@ -112,24 +111,10 @@ class Glass:
 
     def _require_within_range(self, wavelength: float | Tensor) -> None:
         first, last = self.wavelengths
-        for value in _extremes(wavelength):
+        for value in extremes(wavelength):
             # Written so that NaN is outside, too.
             if not first * (1.0 - _ROUNDING) <= value <= last * (1.0 + _ROUNDING):
                 raise InputError(
                     f"glass '{self.name}': wavelength {value:g} nm lies outside its range, "
                     f"{first:g} to {last:g} nm"
                 )
-
-
-def _extremes(wavelength: float | Tensor) -> list[float]:
-    """Shortest and longest wavelength, or nothing where they cannot be looked at."""
-    if not isinstance(wavelength, Tensor):
-        return [wavelength]
-    if torch.compiler.is_compiling() or wavelength.numel() == 0 or wavelength.is_meta:
-        return []
-    if wavelength.is_cuda and torch.cuda.is_current_stream_capturing():
-        return []
-    # The values beneath vmap and the like: read once, and never part of the result.
-    plain = torch.func.debug_unwrap(wavelength.detach(), recurse=True)
-    # What is computed from them within vjp is wrapped again: PyTorch 2.9 gives no list of it.
-    return [value.item() for value in torch.aminmax(plain)]

@@ -12,6 +12,7 @@ from dolens.optics.axial_ray import reversals
 from dolens.optics.backend import check_backend, is_few
 from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.departures import astigmatism_of, index_offsets, irregular
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
@@ -113,6 +114,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter
+        require_wavelengths(wavelengths or (), f"lens '{name}'")
         self.wavelengths = None if wavelengths is None else tuple(wavelengths)
         if reference_wavelength is None and self.wavelengths:
             reference_wavelength = self.wavelengths[0]

@@ -95,7 +95,7 @@ def test_a_page_is_known_as_one(page, tmp_path):
     ("options", "said"),
     [
         ({"fields": [[0, 95]]}, "fields must be within ±90 degrees"),
-        ({"wavelengths": [0.55, -1]}, "wavelengths must be positive numbers in nm"),
+        ({"wavelengths": [0.55]}, "wavelength 0.55 nm: allowed: 50 nm to 10 mm"),
         ({"wavelengths": [550, 550]}, "wavelengths: one is given twice"),
         ({"f_number": 4.0, "entrance_pupil_diameter": 3.0}, "not both"),
         ({"f_number": -2.0}, "f_number must be positive"),
