@@ -38,8 +38,8 @@ def convert(
     from dolens.prescriptions.files import read_lens_file
 
     prescription, passed_over = read_lens_file(old)
-    if not force and new.exists():
-        same = new.samefile(old)
+    if not force and os.path.lexists(new):
+        same = os.path.exists(new) and new.samefile(old)
         raise InputError(
             f"{new}: {'is A itself' if same else 'exists already'}; --force overwrites it"
         )
