@@ -85,9 +85,11 @@ def _content(text: str, where: str) -> Any:
         level = [content]
         for _ in range(_DEEPEST):
             level = [entry for value in level for entry in _entries(value)]
-        if not level:
-            return content
-        raise RecursionError
+        if level:
+            raise RecursionError
+        if "\\u" in text:
+            json.dumps(content, ensure_ascii=False).encode()  # raises at half of a surrogate pair
+        return content
     except RecursionError:
         raise InputError(f"{where}: is not valid JSON (it is nested too deeply)") from None
     except ValueError as error:

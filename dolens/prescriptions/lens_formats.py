@@ -154,7 +154,11 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
     if chosen is None or chosen.write is None:
         why = f"{chosen.name} is read, not written" if chosen else "unknown suffix"
         raise InputError(f"{path}: {why}; lens files are written as {', '.join(WRITTEN_SUFFIXES)}")
-    return chosen.write(prescription, str(path))
+    try:
+        return chosen.write(prescription, str(path))
+    except UnicodeEncodeError as error:
+        half = error.object[error.start : error.end]
+        raise InputError(f"{path}: no text file holds half of a surrogate pair, {half}") from None
 
 
 def _utf_8(data: bytes, where: str, kind: str) -> str:
