@@ -45,6 +45,7 @@ def main(arguments: Sequence[str], program: str) -> None:
     use_working_folder()
     start = hydra.main(str(packaged_configuration()), "train", version_base="1.3")(job)
     try:
+        sys.argv = [program]  # Hydra's parser of options is named by it
         arguments = prepared(arguments, program)
         with own_arguments(arguments) as own:
             sys.argv = [program, *own]
