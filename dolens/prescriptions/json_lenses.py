@@ -6,6 +6,7 @@ infinite number is `Infinity`, as those programs write it, or the text `"inf"`, 
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -105,8 +106,8 @@ def _entries(value: Any) -> Iterable[Any]:
 def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        counts = Counter(key for key, _ in pairs)
+        twice = next(key for key in counts if counts[key] > 1)
         raise ValueError(f"key '{twice}' is given twice")
     return found
 

@@ -84,8 +84,8 @@ def read_configurations(
     said = f"which set {shown} (read: the current one, {current:.6g})"
     most = min(MOST_STATES, _MOST_LINES // _lines_of(file))
     if count > most:
-        why = f"a lens of this size has {most} states at most"
-        return {}, [f"the other {count - 1:.6g} of {count:.6g} configurations, {said}: {why}"]
+        limit = f"a lens of this size has {most} states at most"
+        return {}, [f"the other {count - 1:.6g} of {count:.6g} configurations, {said}: {limit}"]
     try:
         settings = _settings(file, set(differ), where)
     except InputError as problem:
