@@ -62,8 +62,9 @@ def check_keys(given: Iterable[object], allowed: Iterable[str], where: str) -> N
         InputError: a key that is not allowed; the message names the nearest one that is.
     """
     allowed = list(allowed)
+    known = set(allowed)
     for key in given:
-        if str(key) not in allowed:
+        if str(key) not in known:
             raise InputError(
                 f"{where}: unknown key '{key}'{did_you_mean(str(key), allowed)} "
                 f"(allowed: {', '.join(allowed) or 'none'})"

@@ -1,8 +1,56 @@
-"""Text files of other programs are decoded, whatever program and system wrote them."""
+"""Files that a user or a stranger names are read and decoded, whatever system wrote them."""
 
 import codecs
+import os
+import stat
+from pathlib import Path
 
 from dolens.errors import InputError
+
+# What is no file of bytes: reading it would wait for another program, or never end.
+_OTHERS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+_AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
+
+
+def read_file(path: str | Path, most_bytes: int, what: str = "lens file") -> bytes:
+    """Return what a file holds; what is no file, or too large, is refused without being read.
+
+    Args:
+        path: the file, or a link to it.
+        most_bytes: the largest size that is read.
+        what: what the file is to be, for messages.
+
+    Raises:
+        InputError: it is a folder, a pipe or a device, it is missing, too large or cannot be read,
+            or the path is none; one line that names it.
+    """
+    try:
+        _require_file(os.stat(path), path, what)
+        # It may be another one by now: what was opened is looked at again, and opens at once.
+        with os.fdopen(os.open(path, os.O_RDONLY | _AT_ONCE), "rb") as file:
+            _require_file(os.fstat(file.fileno()), path, what)
+            data = file.read(most_bytes + 1)
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError:  # a zero byte, or half of a surrogate pair
+        raise InputError(f"{path}: is no path of a file") from None
+    if len(data) > most_bytes:
+        raise InputError(f"{path}: is larger than {most_bytes // 2**20} MB, and no {what}")
+    return data
+
+
+def _require_file(state: os.stat_result, path: str | Path, what: str) -> None:
+    for holds, kind in _OTHERS:
+        if holds(state.st_mode):
+            raise InputError(f"{path}: is {kind}, no {what}")
 
 
 def decode_text(data: bytes, where: str) -> str:

@@ -1,10 +1,13 @@
 """HTML from nested calls; all text is escaped."""
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from html import escape
 
 # Elements without content, which have no end tag.
 _VOID = frozenset({"br", "hr", "img", "input", "link", "meta"})
+# Also halves of surrogate pairs, which no file may hold.
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class Markup(str):
@@ -26,7 +29,7 @@ def element(tag: str, *children: Child, **attributes: str | None) -> Markup:
         attributes: escaped; `class_` is `class`, `data_x` is `data-x`; None is left out.
     """
     written = "".join(
-        f' {name.rstrip("_").replace("_", "-")}="{escape(value)}"'
+        f' {name.rstrip("_").replace("_", "-")}="{escape(_shown(value))}"'
         for name, value in attributes.items()
         if value is not None
     )
@@ -34,11 +37,16 @@ def element(tag: str, *children: Child, **attributes: str | None) -> Markup:
     return Markup(f"<{tag}{written}>{joined(*children)}{end}")
 
 
+def _shown(text: str) -> str:
+    """Return text without control characters, which no page may hold."""
+    return _CONTROL.sub("�", text)
+
+
 def joined(*children: Child) -> Markup:
     """Return markup and escaped text, one after another."""
     return Markup(
         "".join(
-            child if isinstance(child, Markup) else escape(child)
+            child if isinstance(child, Markup) else escape(_shown(child))
             for child in children
             if child is not None
         )

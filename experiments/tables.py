@@ -1,12 +1,17 @@
-"""Tables that a run leaves as CSV files."""
+"""Tables are CSV files: those that a run leaves, and those that a user names."""
 
 import csv
+import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from dolens.errors import InputError
+from dolens.file_text import decode_text, read_file
 from dolens.whole_files import written_whole
 
 Row = Mapping[str, float | str]
+# A table of a thousand columns and ten thousand rows has less.
+_MOST_BYTES = 64 * 2**20
 
 
 def write_table(path: Path, rows: Iterable[Row], digits: int | None = None) -> None:
@@ -27,6 +32,27 @@ def write_table(path: Path, rows: Iterable[Row], digits: int | None = None) -> N
         writer.writeheader()
         for row in kept:
             writer.writerow({key: _written(value, digits) for key, value in row.items()})
+
+
+def read_table(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
+    """Return the rows of a CSV file: name of the column → text.
+
+    Args:
+        path: the file.
+        columns: names that it must have among its own.
+
+    Raises:
+        InputError: the file cannot be read, is no table, or lacks a column.
+    """
+    text = decode_text(read_file(path, _MOST_BYTES, "table"), str(path))
+    try:
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        found = list(reader.fieldnames or ())
+        if not set(columns) <= set(found):
+            raise InputError(f"{path}: columns {found}; allowed: {', '.join(columns)}")
+        return list(reader)
+    except csv.Error as error:  # such as a cell of a megabyte
+        raise InputError(f"{path}: is no table ({error})") from None
 
 
 def _written(value: float | str, digits: int | None) -> float | str:

@@ -4,6 +4,7 @@ A command's own file imports what it needs when it runs, so that `dolens --help`
 the commands about a lens work without the packages that training needs.
 """
 
+import io
 import sys
 from typing import Annotated
 
@@ -36,6 +37,10 @@ app = typer.Typer(
 def main() -> None:
     """Run the command; a user's mistake ends it with one line and exit status 1."""
     choose_waiting()
+    for stream in (sys.stdout, sys.stderr):
+        # Names of files may hold what no terminal shows.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         app()
     except InputError as error:

@@ -27,6 +27,7 @@ def check(
     """
     import json
 
+    from dolens.errors import readable
     from dolens.prescriptions.check_files import as_data, check_files, lens_files, summary
 
     files = lens_files(folder, suffix or ())
@@ -38,7 +39,7 @@ def check(
         name = done.path if folder.is_file() else str(Path(done.path).relative_to(folder))
         said = f"passed over: {'; '.join(done.passed_over)}" if done.passed_over else ""
         status = "loads" if done.loads else "refused"
-        typer.echo(f"{status:8}{name}: {done.reason or said}".rstrip(": "))
+        typer.echo(readable(f"{status:8}{name}: {done.reason or said}").rstrip(": "))
     if json_output:
         typer.echo(json.dumps(as_data(found), indent=2, ensure_ascii=False))
     else:

@@ -33,13 +33,13 @@ def convert(
     """
     from rich.console import Console
 
-    from dolens.errors import InputError
+    from dolens.errors import InputError, readable
     from dolens.prescriptions.conversion import converted
     from dolens.prescriptions.files import read_lens_file
 
     prescription, passed_over = read_lens_file(old)
-    if not force and new.exists():
-        same = new.samefile(old)
+    if not force and os.path.lexists(new):
+        same = os.path.exists(new) and new.samefile(old)
         raise InputError(
             f"{new}: {'is A itself' if same else 'exists already'}; --force overwrites it"
         )
@@ -51,9 +51,11 @@ def convert(
 
     console = Console(highlight=False, soft_wrap=True)
     surfaces = len(found.after.surfaces)
-    console.print(f"{new}: written, {surfaces} surface{'s' * (surfaces != 1)}", markup=False)
+    console.print(
+        f"{readable(new)}: written, {surfaces} surface{'s' * (surfaces != 1)}", markup=False
+    )
     for change in changes:
-        console.print(f"  - {change}", markup=False)
+        console.print(f"  - {readable(change)}", markup=False)
     if not changes:
         console.print("  nothing was lost or changed", markup=False)
     elif found.same_numbers:

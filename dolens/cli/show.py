@@ -102,7 +102,9 @@ def show(
     console.print(printable(overview.name), style="bold", markup=False)
     console.print(overview.summary, style="dim", markup=False)
     if passed_over:
-        console.print(f"passed over: {'; '.join(passed_over)}", style="dim", markup=False)
+        console.print(
+            f"passed over: {printable('; '.join(passed_over))}", style="dim", markup=False
+        )
     for section in overview.sections:
         console.print()
         console.print(section.title, style="bold cyan", markup=False)

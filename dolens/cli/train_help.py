@@ -8,6 +8,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from dolens.experiments.running.catalogue import (
+    added_folders,
     configuration_folders,
     experiments,
     groups,
@@ -44,7 +45,7 @@ def show_help(arguments: Sequence[str], program: str) -> None:
     """
     console = Console(highlight=False)
     command = f"python {program}" if program.endswith(".py") else program
-    folders = [*configuration_folders(Path.cwd()), *_added(arguments)]
+    folders = [*configuration_folders(Path.cwd()), *added_folders(arguments)]
     console.print(f"\n[bold]Usage:[/] {command} experiment=NAME \\[KEY=VALUE ...] \\[OPTIONS]\n")
     console.print(
         "Run an experiment: train a camera, design a lens, find its tolerances or its pose. "
@@ -107,13 +108,3 @@ def _columns(rows: Sequence[tuple[str, str]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def _added(arguments: Sequence[str]) -> list[Path]:
-    """The folder of `--config-dir`."""
-    for place, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if option in ("--config-dir", "-cd"):
-            text = value if equals else next(iter(arguments[place + 1 :]), "")
-            return [Path(text)] if Path(text).is_dir() else []
-    return []

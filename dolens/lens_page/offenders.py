@@ -30,7 +30,7 @@ from dolens.lens_page.tables import Table, number
 from dolens.optics.lens import Lens
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
 from dolens.prescriptions.checks import require_mapping
-from dolens.prescriptions.files import decode_yaml
+from dolens.prescriptions.files import read_yaml_file
 from dolens.prescriptions.poses import elements_from
 from dolens.tolerancing import (
     Contributions,
@@ -166,10 +166,9 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
 def _read(lens: Lens, path: Path, notes: list[str]) -> tuple[Mapping[str, Any], Any]:
     """Return the tolerances of a file and their factor; the lens gets the file's elements."""
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"--tolerances: {path}: cannot be read ({error.strerror})") from None
-    content = decode_yaml(data, path)
+        content = read_yaml_file(path, "file of tolerances")
+    except InputError as error:
+        raise InputError(f"--tolerances: {error}") from None
     require_mapping(content, str(path))
     elements = content.get("elements")
     if "defaults" in content:

@@ -1,5 +1,6 @@
 """The page of a lens is written: one file that needs nothing else."""
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -101,6 +102,8 @@ def write_page(
 
 def is_page(path: str | Path) -> bool:
     """Return whether a file is a page that `write_page` wrote."""
+    if not os.path.isfile(path):
+        return False
     with Path(path).open("rb") as file:
         return f'name="generator" content="{GENERATOR} '.encode() in file.read(600)
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import matplotlib
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from dolens.manufacturing.assembly_sheet import assembly_sheets, sheet_count
+from dolens.manufacturing.drawing_numbers import EQUATIONS
 from dolens.manufacturing.drawing_sheet import TitleBlock
 from dolens.manufacturing.element_sheet import element_sheet
 from dolens.manufacturing.glass_elements import glass_elements
@@ -64,6 +66,11 @@ def drawing_figures(
     named = {f"assembly_{n}" if n > 1 else "assembly": s for n, s in enumerate(sheets, 1)}
     for number, element in enumerate(whole, first + 1):
         named[element.name] = element_sheet(element, tolerances, block, number)
+    for sheet in named.values():
+        for text in sheet.findobj(Text):
+            # A name is no formula, whatever signs it has.
+            if isinstance(text, Text) and text.get_text() not in EQUATIONS.values():
+                text.set_parse_math(False)
     return named, [fault for fault in faults.values() if fault is not None]
 
 

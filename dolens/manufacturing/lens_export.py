@@ -11,6 +11,7 @@ from dolens.manufacturing.shop_tolerances import ShopTolerances
 from dolens.manufacturing.solids_picture import solids_figure
 from dolens.manufacturing.step import TOLERANCE_NM, StepResult, export_step
 from dolens.optics.lens import Lens
+from dolens.plotting.captions import plain_text
 from dolens.plotting.export import save_figure
 from dolens.prescriptions.files import save_lens
 
@@ -116,7 +117,9 @@ def _solids(exported: Exported, lens: Lens, folder: Path, tolerance_nm: float) -
         "volumes_mm3": dict(result.volumes),
         "left_out": list(result.left_out),
     }
-    save_figure(solids_figure(result.solids, f"{lens.name}: solids"), folder / "lens_solids.png")
+    save_figure(
+        solids_figure(result.solids, f"{plain_text(lens.name)}: solids"), folder / "lens_solids.png"
+    )
     exported.files["lens_solids.png"] = {"is": "a picture of the solids of lens.step"}
 
 

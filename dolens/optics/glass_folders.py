@@ -14,14 +14,14 @@ from functools import lru_cache
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text
+from dolens.file_text import decode_text, read_file
 from dolens.optics.agf import AgfEntry, parse_agf, read_entry
 from dolens.optics.glass import Glass
 
 VARIABLE = "DOLENS_GLASS"
 _NM_PER_UM = 1000.0
 # The largest catalogue of a maker has 2 MB.
-_LARGEST = 50_000_000
+_LARGEST = 32 * 2**20
 # Set for as long as a lens is read or written, by `glass_folders`.
 _asked: ContextVar[tuple[Path, ...]] = ContextVar("glass folders", default=())
 
@@ -36,7 +36,7 @@ def glass_folders(places: Sequence[str | Path] | str | Path | None) -> Iterator[
     given = [places] if isinstance(places, str | Path) else list(places or ())
     paths = tuple(Path(place) for place in given)
     for path in paths:
-        if not path.exists():
+        if not os.path.exists(path):
             raise InputError(f"glass catalogues: '{path}' is no folder and no file")
     token = _asked.set((*paths, *_asked.get()))
     try:
@@ -54,15 +54,22 @@ def user_catalogues() -> dict[str, Path]:
     named = [Path(place) for place in os.environ.get(VARIABLE, "").split(os.pathsep) if place]
     found: dict[str, Path] = {}
     for place in (*_asked.get(), *named):
-        if place.is_dir():
-            files = sorted(p for p in place.iterdir() if p.suffix.lower() == ".agf")
-        elif place.is_file():
+        if os.path.isdir(place):
+            files = sorted(p for p in _listed(place) if p.suffix.lower() == ".agf")
+        elif os.path.exists(place):
             files = [place]
         else:
             raise InputError(f"{VARIABLE}: '{place}' is no folder and no file")
         for file in files:
             found.setdefault("".join(file.stem.upper().split()), file)
     return found
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror})") from None
 
 
 def user_entries(file: Path) -> dict[str, AgfEntry]:
@@ -98,10 +105,5 @@ def user_glass(catalogue: str, entry: AgfEntry) -> Glass:
 # The time and size of the file are part of the key: an edited catalogue is read again.
 @lru_cache(maxsize=64)
 def _entries(file: Path, changed: int, size: int) -> dict[str, AgfEntry]:
-    if size > _LARGEST:
-        raise InputError(f"{file}: is too large for a glass catalogue ({size} bytes)")
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    data = read_file(file, _LARGEST, "glass catalogue")
     return parse_agf(decode_text(data, str(file)), str(file))

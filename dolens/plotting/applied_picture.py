@@ -8,6 +8,7 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn import functional
 
+from dolens.plotting.captions import plain_text
 from dolens.plotting.style import SMALL
 from dolens.plotting.titles import draw_title
 
@@ -35,8 +36,9 @@ def applied_figure(
     tall = min(max(height / width, 0.3), 2.0) * _PANEL
     figure = Figure(figsize=(_PANEL * len(images) + 0.2, tall + _PANEL + 0.8), layout="constrained")
     axes = figure.subplots(2, len(images), squeeze=False, height_ratios=(tall, _PANEL))
-    for column, (name, image) in enumerate(images.items()):
-        quality = f", {psnr[name]:.1f} dB" if name in psnr else ""
+    for column, (label, image) in enumerate(images.items()):
+        name = plain_text(label)
+        quality = f", {psnr[label]:.1f} dB" if label in psnr else ""
         whole, part = axes[0, column], axes[1, column]
         whole.imshow(_pixels(_shrunk(image)), extent=(0, width, height, 0), interpolation="nearest")
         whole.add_patch(

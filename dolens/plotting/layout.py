@@ -13,6 +13,7 @@ from torch import Tensor
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 from dolens.optics.system import OpticalSystem
+from dolens.plotting.captions import plain_text
 from dolens.plotting.drawing import draw_layout, layout_drawing
 from dolens.plotting.number_text import number_text, with_minus
 from dolens.plotting.style import PAGE, SMALL, open_axes
@@ -129,7 +130,7 @@ def shown_name(lens: Lens) -> str:
 
     A figure says itself whether it shows the lens before or after.
     """
-    return lens.name.removesuffix(", initial")
+    return plain_text(lens.name.removesuffix(", initial"))
 
 
 def optics_text(

@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.plotting.captions import plain_text
 from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
@@ -229,7 +230,7 @@ def tolerance_label(name: str, tolerance: str) -> str:
     match = _TOLERANCE.fullmatch(tolerance)
     assert match is not None  # as `Tolerances.label` writes it
     number, unit = match.groups()
-    return f"{parameter_label(name)}, ±{number_text(float(number), 4)}{unit}"
+    return f"{plain_text(parameter_label(name))}, ±{number_text(float(number), 4)}{unit}"
 
 
 def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:

@@ -44,6 +44,8 @@ from dolens.prescriptions.checks import as_number, as_numbers, require_mapping
 
 APERTURE_KEYS = ("semi_diameter", "clips", "aperture", "obscuration")
 AUTOMATIC = "auto"
+# Of what is blocked; light is compared with each.
+_MOST_PARTS = 1000
 # Stands for an automatic semi-diameter (mm) until the light of the fields is known.
 _UNKNOWN = 1.0
 # Keys of an outline, all of them necessary, and what is made of their numbers.
@@ -166,6 +168,8 @@ def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float
         return _outline(value, _BLOCKING, place)
     if not value:
         raise InputError(f"{place}: is an empty list")
+    if len(value) > _MOST_PARTS:
+        raise InputError(f"{place}: has {len(value)} parts (allowed: {_MOST_PARTS} at most)")
     parts = [_outline(part, _BLOCKING, f"{place} {number}") for number, part in enumerate(value, 1)]
     return Together(tuple(parts)), (0.0, 0.0)
 

@@ -195,8 +195,9 @@ def _shape(letter: str, words: list[str], said: Mapping[str, Any], place: str) -
     if _LETTERS.get(wanted) != letter:
         raise InputError(f"{place}: line 2 calls this row of type {letter} a '{wanted}'")
     names = [str(name) for name in said.get("parameters", found)]
+    kept = set(names)
     for name in (*found, *names):
-        if (name in found) != (name in names) and found.get(name):
+        if (name in found) != (name in kept) and found.get(name):
             raise InputError(f"{place}: line 2 leaves out '{name}', which is {found[name]!r}")
     row: dict[str, Any] = {"type": wanted}
     if wanted == "plane":

@@ -1,6 +1,7 @@
 """Lens files are read and written."""
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError, did_you_mean
+from dolens.file_text import read_file
 from dolens.optics.glass_folders import glass_folders
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
@@ -22,13 +24,13 @@ from dolens.whole_files import written_whole
 __all__ = [
     "SUFFIXES",
     "decode_prescription",
-    "decode_yaml",
     "encode_prescription",
     "find_lens",
     "lens_names",
     "load_lens",
     "load_prescription",
     "read_lens_file",
+    "read_yaml_file",
     "save_lens",
 ]
 
@@ -82,7 +84,7 @@ def find_lens(path: str | Path) -> Path:
     path = Path(path)
     name = path.as_posix()
     published = path.parent.as_posix() == _PUBLISHED
-    if path.suffix or path.is_file() or not (path.name == name or published):
+    if path.suffix or os.path.isfile(path) or not (path.name == name or published):
         return path
     allowed = published_lens_names() if published else lens_names()
     if name not in allowed:
@@ -112,13 +114,7 @@ def load_prescription(path: str | Path) -> Any:
 def read_lens_file(path: str | Path) -> ReadPrescription:
     """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: is larger than {MOST_BYTES // 2**20} MB, and no lens")
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return read_lens(data, path)
+    return read_lens(read_file(path, MOST_BYTES), path)
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:
@@ -126,21 +122,21 @@ def decode_prescription(data: bytes, path: str | Path) -> Any:
     return read_lens(data, path).prescription
 
 
-def decode_yaml(data: bytes, where: str | Path) -> Any:
-    """Read YAML as plain values; nothing in it names code, and no key may be given twice.
+def read_yaml_file(path: str | Path, what: str) -> Any:
+    """Read a YAML file as plain values; nothing in it names code, and no key may be given twice.
 
     Args:
-        data: what the file holds.
-        where: its name, for messages.
+        path: the file.
+        what: what it is to be, for messages.
 
     Raises:
-        InputError: it is not valid YAML; the message is one line.
+        InputError: it cannot be read, or is not valid YAML; the message is one line.
     """
     try:
-        text = data.decode("utf-8")
+        text = read_file(path, MOST_BYTES, what).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not valid YAML ({error})") from None
-    return plain_values(text, str(where))
+        raise InputError(f"{path}: is not valid YAML ({error})") from None
+    return plain_values(text, str(path))
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:

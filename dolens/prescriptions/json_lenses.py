@@ -6,7 +6,8 @@ infinite number is `Infinity`, as those programs write it, or the text `"inf"`, 
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from dolens.errors import InputError
@@ -17,6 +18,7 @@ from dolens.prescriptions.read_file import ReadPrescription
 
 # Longer text is no number that a program writes, and is slow to read.
 _LONGEST_NUMBER = 400
+_DEEPEST = 100
 
 
 def read_json(text: str, where: str) -> ReadPrescription:
@@ -75,23 +77,37 @@ _READERS: tuple[
 
 def _content(text: str, where: str) -> Any:
     try:
-        return json.loads(
+        content = json.loads(
             text,
             object_pairs_hook=_mapping,
             parse_int=_integer,
             parse_float=_number,
         )
+        level = [content]
+        for _ in range(_DEEPEST):
+            level = [entry for value in level for entry in _entries(value)]
+        if level:
+            raise RecursionError
+        if "\\u" in text:
+            json.dumps(content, ensure_ascii=False).encode()  # raises at half of a surrogate pair
+        return content
     except RecursionError:
         raise InputError(f"{where}: is not valid JSON (it is nested too deeply)") from None
     except ValueError as error:
         raise InputError(f"{where}: is not valid JSON ({error})") from None
 
 
+def _entries(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
+
+
 def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        names = [key for key, _ in pairs]
-        twice = next(key for n, key in enumerate(names) if key in names[:n])
+        counts = Counter(key for key, _ in pairs)
+        twice = next(key for key in counts if counts[key] > 1)
         raise ValueError(f"key '{twice}' is given twice")
     return found
 

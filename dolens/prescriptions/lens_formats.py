@@ -32,16 +32,33 @@ class LensFormat:
     Attributes:
         name: in messages and tables.
         suffixes: of its files, in small letters; the first is the usual one.
-        signs: matches text that is surely of this format, whatever the file's name; or None.
+        signs: one after the other, in text that is surely of this format, whatever the file's
+            name; none where no text is.
         read: from decoded text and the file's name to its prescription.
         write: from a prescription and the file's name to bytes; None where it is only read.
     """
 
     name: str
     suffixes: tuple[str, ...]
-    signs: re.Pattern[str] | None
+    signs: tuple[re.Pattern[str], ...]
     read: Callable[[str, str], ReadPrescription]
     write: Callable[[Mapping[str, Any], str], bytes] | None
+
+
+def _lines(*patterns: str) -> tuple[re.Pattern[str], ...]:
+    """Return expressions for whole lines: they look at no line twice, however long it is."""
+    return tuple(re.compile(rf"^{pattern}[ \t\r]*$", re.MULTILINE) for pattern in patterns)
+
+
+def _is_of(text: str, signs: tuple[re.Pattern[str], ...]) -> bool:
+    """Return whether text has the signs of a format, one after the other."""
+    at = 0
+    for sign in signs:
+        found = sign.search(text, at)
+        if found is None:
+            return False
+        at = found.end()
+    return bool(signs)
 
 
 def _read_diffoptics(text: str, where: str) -> ReadPrescription:
@@ -53,38 +70,38 @@ FORMATS: tuple[LensFormat, ...] = (
     LensFormat(
         "dolens YAML",
         (".yaml", ".yml"),
-        re.compile(r"^surfaces:\s*$", re.MULTILINE),
+        _lines(r"surfaces:"),
         read_yaml,
         yaml_of,
     ),
     LensFormat(
         "Zemax",
         (".zmx",),
-        re.compile(r"^SURF 0\s*$", re.MULTILINE),
+        _lines(r"SURF 0"),
         read_zemax,
         lambda prescription, where: encode_zemax(zemax_of(prescription, where)),
     ),
     LensFormat(
         "OSLO",
         (".len", ".osl"),
-        re.compile(r"^\s*LEN\s+NEW\b", re.MULTILINE | re.IGNORECASE),
+        _lines(r"[ \t]*(?i:LEN[ \t]+NEW)\b.*"),
         read_oslo,
         None,
     ),
     LensFormat(
         "CODE V",
         (".seq",),
-        re.compile(r"^\s*SO\s+[-+.\d].*^\s*SI\b", re.MULTILINE | re.IGNORECASE | re.DOTALL),
+        _lines(r"[ \t]*(?i:SO)[ \t]+[-+.\d].*", r"[ \t]*(?i:SI)\b.*"),
         read_codev,
         lambda prescription, where: codev_of(prescription, where).encode(),
     ),
-    LensFormat("JSON", (".json",), re.compile(r"\A\s*\{"), read_json, json_of),
+    LensFormat("JSON", (".json",), (re.compile(r"\A\s*\{"),), read_json, json_of),
     # Of ray-optics; its JSON is found by its content.
-    LensFormat("JSON", (".roa",), None, read_json, None),
+    LensFormat("JSON", (".roa",), (), read_json, None),
     LensFormat(
         "dO text",
         (".txt",),
-        None,
+        (),
         _read_diffoptics,
         lambda prescription, where: diffoptics_text_of(prescription, where).encode(),
     ),
@@ -115,7 +132,7 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
         return named.read(_utf_8(data, where, "YAML"), where)
     text = decode_text(data, where).removeprefix("\ufeff")
     begin = text[:_LOOKED_AT]
-    by_content = next((each for each in FORMATS if each.signs and each.signs.search(begin)), None)
+    by_content = next((each for each in FORMATS if _is_of(begin, each.signs)), None)
     chosen = by_content or named
     if chosen is None:
         raise InputError(
@@ -137,7 +154,11 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
     if chosen is None or chosen.write is None:
         why = f"{chosen.name} is read, not written" if chosen else "unknown suffix"
         raise InputError(f"{path}: {why}; lens files are written as {', '.join(WRITTEN_SUFFIXES)}")
-    return chosen.write(prescription, str(path))
+    try:
+        return chosen.write(prescription, str(path))
+    except UnicodeEncodeError as error:
+        half = error.object[error.start : error.end]
+        raise InputError(f"{path}: no text file holds half of a surrogate pair, {half}") from None
 
 
 def _utf_8(data: bytes, where: str, kind: str) -> str:

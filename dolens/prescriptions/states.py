@@ -38,6 +38,9 @@ from dolens.prescriptions.published import PUBLISHED_KEY, published_rows
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 STATES_KEY = "states"
+MOST_STATES = 100
+# Surfaces of the lenses in all states together: so many are built in seconds.
+_MOST_SURFACES = 10_000
 _WAVES = ("wavelengths", "reference_wavelength", "wavelength_weights")
 _AIR = ("temperature", "pressure")
 _DATA = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS, PUBLISHED_KEY)
@@ -65,6 +68,12 @@ def with_states(lens: Lens, prescription: Mapping[str, Any], build: Build, where
     """
     given = prescription[STATES_KEY]
     require_mapping(given, f"{where}: {STATES_KEY}")
+    most = min(MOST_STATES, _MOST_SURFACES // len(lens.surfaces))
+    if len(given) > most:
+        raise InputError(
+            f"{where}: has {len(given)} states; a lens of {len(lens.surfaces)} surfaces has {most} "
+            "at most"
+        )
     others: dict[str, Lens] = {}
     owned: dict[str, list[str]] = {}
     for name, overlay in given.items():

@@ -12,6 +12,9 @@ from dolens.prescriptions.read_file import ReadPrescription
 
 # Far more than a lens has; aliases (*name) let a short file mean billions of values.
 _MOST_VALUES = 2_000_000
+_DEEPEST = 100
+# A number of a surface; Python's tables are slow to hold many larger ones.
+_LARGEST_KEY = 2**32
 # Longer text is no number that a program writes, and is slow to read.
 _LONGEST_NUMBER = 400
 _TAG = "tag:yaml.org,2002:"
@@ -19,7 +22,11 @@ _TAG = "tag:yaml.org,2002:"
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 
-class _PlainLoader(yaml.SafeLoader):
+# The one in C is written for speed, and reads the same.
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _PlainLoader(_SafeLoader):
     """This safe YAML loader builds plain values only, and reads numbers as decimals.
 
     YAML's own dates and its numbers to other bases (`0b1`, `1:30`) are texts.  It also refuses a
@@ -38,8 +45,10 @@ class _PlainLoader(yaml.SafeLoader):
         scalars = [key for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
         for key_node in scalars:
             key = self.construct_object(key_node, deep=True)
+            line = key_node.start_mark.line + 1
+            if isinstance(key, int) and abs(key) > _LARGEST_KEY:
+                raise yaml.YAMLError(f"key '{key_node.value}' in line {line} is too large a number")
             if key in seen:
-                line = key_node.start_mark.line + 1
                 raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
             seen.add(key)
         return super().construct_mapping(node, deep)
@@ -105,12 +114,27 @@ def plain_values(text: str, where: str) -> Any:
         InputError: it is not valid YAML; the message is one line.
     """
     try:
+        _require_modest(text)
         # A subclass of the safe loader: it builds plain values only.
         return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{where}: is not valid YAML ({one_line(error)})") from None
-    except RecursionError:
-        raise InputError(f"{where}: is not valid YAML (it is nested too deeply)") from None
+
+
+def _require_modest(text: str) -> None:
+    """Raise `YAMLError` where text is nested too deeply, or has too many values; it is read event
+    by event, and nothing is built.
+    """
+    depth, values = 0, 0
+    for event in yaml.parse(text, Loader=_SafeLoader):
+        if isinstance(event, yaml.NodeEvent):
+            values += 1
+            depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise yaml.YAMLError("it is nested too deeply")
+        if values > _MOST_VALUES:
+            raise yaml.YAMLError(f"it means more than {_MOST_VALUES} values")
 
 
 def _values_in(node: yaml.Node, known: dict[int, int]) -> int:

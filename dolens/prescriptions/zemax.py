@@ -39,6 +39,8 @@ SYSTEM_OPERANDS = (
     *("WAVM", "WAVL", "WAVN", "WWGT", "WWGN", "PWAV"),
     "MNUM",
 )
+# As many as a lens may have.
+_MOST_SURFACES = 10_000
 # Not str.splitlines: it also breaks at letters that Latin-1 text may hold.
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
@@ -118,6 +120,8 @@ def parse_zemax(text: str, where: str) -> ZemaxFile:
         indent = len(raw) - len(raw.lstrip())
         if line.operand == "SURF":
             _check_number(file, line, where)
+            if len(file.surfaces) > _MOST_SURFACES:
+                raise InputError(f"{where}: line {at}: more than {_MOST_SURFACES} surfaces")
             block, margin = {}, indent
             file.surfaces.append(block)
         elif block is not None and line.operand in SURFACE_OPERANDS:

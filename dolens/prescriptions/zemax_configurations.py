@@ -9,17 +9,19 @@ A configuration is read as the file would be, were it the current one: its numbe
 those of the surfaces and the system.  One that cannot be held is passed over, and listed: where it
 changes a glass, a type or the stop, where a solve would change the lens with it (its result is
 written for the current configuration alone), or where its temperature differs (the numbers of such
-a file are those at that temperature).
+a file are those at that temperature).  So are all but the current one of a file with more
+configurations than a lens has states, or whose lines would be read too often for them.
 """
 
-import copy
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.states import MOST_STATES
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile
 from dolens.prescriptions.zemax_settings import apply_setting
@@ -35,6 +37,10 @@ _SOLVES = (
     *("PXDT", "PIKC", "PIKT", "PIKD", "PIKG", "PIKK", "TOLE", "TCOM"),
 )
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
+# Lines of a file, once for each of its configurations: so many are read in seconds.
+_MOST_LINES = 1_000_000
+# Operands that are named in a sentence.
+_NAMED = 8
 # Keys of a prescription that a state may have for itself.
 _WAVES = ("wavelengths", "wavelength_weights", "reference_wavelength")
 _KEYS = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS)
@@ -75,11 +81,21 @@ def read_configurations(
     differ = _differing(file)
     if count < 2 or not differ:
         return {}, []
+    shown = ", ".join([*differ[:_NAMED], *(["…"] if len(differ) > _NAMED else [])])
+    said = f"which set {shown} (read: the current one, {current:.6g})"
+    most = min(MOST_STATES, _MOST_LINES // _lines_of(file))
+    if count > most:
+        limit = f"a lens of this size has {most} states at most"
+        return {}, [f"the other {count - 1:.6g} of {count:.6g} configurations, {said}: {limit}"]
+    try:
+        settings = _settings(file, set(differ), where)
+    except InputError as problem:
+        return {}, [f"the other {count - 1} of {count} configurations, {said}: {problem}"]
     held: dict[int, dict[str, Any]] = {}
     problems: dict[int, str] = {}
     for number in range(1, count + 1):
         try:
-            held[number] = _of_configuration(file, number, lens, read, where)
+            held[number] = _of_configuration(file, settings.get(number, ()), lens, read)
         except InputError as problem:
             problems[number] = str(problem).removeprefix(f"{where}: ")
     states = _states(file, lens, held, current, where)
@@ -87,7 +103,6 @@ def read_configurations(
         del states[number]
     others = [number for number in range(1, count + 1) if number != current]
     lost = [number for number in others if number not in states]
-    said = f"which set {', '.join(differ)} (read: the current one, {current})"
     names = _names(file, states, lens)
     found = {names[number]: state for number, state in states.items() if names[number]}
     if not lost:
@@ -109,15 +124,32 @@ def _differing(file: ZemaxFile) -> list[str]:
     return [name for name, words in values.items() if len(words) > 1]
 
 
+def _lines_of(file: ZemaxFile) -> int:
+    """Return how many lines are read for each configuration."""
+    blocks = (file.system, *file.surfaces)
+    return 1 + sum(len(lines) for block in blocks for lines in block.values())
+
+
+def _settings(file: ZemaxFile, differ: set[str], where: str) -> dict[float, list[Line]]:
+    """Return the lines of each configuration that set what differs between them."""
+    found: dict[float, list[Line]] = {}
+    for line in configuration_lines(file):
+        if line.operand in _SILENT or len(line.arguments) < 3:
+            continue
+        number = number_in_text(line.arguments[1], f"{where}: line {line.at}")
+        if f"{line.operand} {line.arguments[0]}" in differ:
+            found.setdefault(number, []).append(line)
+    return found
+
+
 def _of_configuration(
-    file: ZemaxFile, number: int, lens: dict[str, Any], read: Read, where: str
+    file: ZemaxFile, settings: Sequence[Line], lens: dict[str, Any], read: Read
 ) -> dict[str, Any]:
     """Return the prescription of a configuration.
 
     Raises:
         InputError: it cannot be held; the message says why.
     """
-    differ = _differing(file)
     if file.skipped:
         raise InputError("the file leaves out numbers of surfaces")
     for solve in _SOLVES:
@@ -126,14 +158,13 @@ def _of_configuration(
     for n, lines in enumerate(file.surfaces):
         if "CURV" in lines and lines["CURV"][-1].arguments[1:2] not in ([], ["0"], ["1"]):
             raise InputError(f"a solve of surface {n} holds for the current one (CURV)")
-    there = copy.deepcopy(file)
-    for line in configuration_lines(file):
-        if line.operand in _SILENT or len(line.arguments) < 3:
-            continue
-        if number_in_text(line.arguments[1], f"{where}: line {line.at}") != number:
-            continue
-        if f"{line.operand} {line.arguments[0]}" in differ:
-            apply_setting(there, line)
+    there = replace(
+        file,
+        system={key: [*lines] for key, lines in file.system.items()},
+        surfaces=[{key: [*lines] for key, lines in block.items()} for block in file.surfaces],
+    )
+    for line in settings:
+        apply_setting(there, line)
     found = read(there)
     _refuse_other_structure(lens, found)
     return found

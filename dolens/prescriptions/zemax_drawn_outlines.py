@@ -12,6 +12,9 @@ from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.zemax import Line
 
+# Each is compared with all others.
+_MOST_POLYGONS = 1000
+
 
 def read_polygons(
     block: Mapping[str, list[Line]], factor: Fraction, place: str
@@ -45,6 +48,10 @@ def read_polygons(
         raise InputError(f"{place}: the outline that the user draws stands in {file}, not here")
     if any(len(polygon) < 3 for polygon in polygons):
         raise InputError(f"{place}: an outline that the user draws needs three corners at least")
+    if len(polygons) > _MOST_POLYGONS:
+        raise InputError(
+            f"{place}: {len(polygons)} outlines that the user draws (allowed: {_MOST_POLYGONS})"
+        )
     _require_apart(polygons, place)
     return polygons
 

@@ -32,13 +32,19 @@ def _read(block: SurfaceBlock) -> Row:
                 f"{block.place}: Zernike polynomials on a grid are not held (XDAT {n}: {word})"
             )
     columns, rows, spacings = _size(block)
+    given = block.lines.get("GARR", [])
+    if columns * rows > len(given):
+        raise InputError(
+            f"{block.place}: GDAT names {columns:.6g} × {rows:.6g} nodes, and {len(given)} have a "
+            "GARR"
+        )
     nodes: list[list[float] | None] = [None] * (columns * rows)
-    for line in block.lines.get("GARR", []):
+    for line in given:
         what = f"{block.place}: GARR (line {line.at})"
         if len(line.arguments) < 5:
             raise InputError(f"{what}: needs a number, sag, two slopes and the twist")
         node = number_in_text(line.arguments[0], what)
-        if node not in range(len(nodes)):
+        if not 0 <= node < len(nodes) or node != int(node):
             raise InputError(f"{what}: must be a node from 0 to {len(nodes) - 1}, not {node:g}")
         if any(float(word) != 0.0 for word in line.arguments[5:6]):
             raise InputError(f"{what}: node {node:g} has no data, which is not held")

@@ -1,7 +1,7 @@
 """The forms that a search left are read from its run folder."""
 
-import csv
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import torch
 from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
+from dolens.experiments.tables import read_table
 from dolens.prescriptions import load_lens
 
 _MM = 1e3  # µm
@@ -64,12 +65,9 @@ def forms_of_run(folder: str | Path, most: int) -> tuple[SearchedForm, ...]:
 
 def _that_hold(table: Path) -> set[str] | None:
     """Return the names of the forms that keep every check; None where no table says so."""
-    if not table.is_file():
+    if not os.path.lexists(table):
         return None
-    with table.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not {"form", "holds"} <= set(rows[0]):
-        raise InputError(f"{table}: not the table of a search (columns form, holds)")
+    rows = read_table(table, ("form", "holds"))
     return {row["form"] for row in rows if row["holds"] == "True"}
 
 

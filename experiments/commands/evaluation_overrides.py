@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 
-from dolens.errors import InputError, one_line
+from dolens.errors import InputError
+from dolens.experiments.running.command_line import read_override
 from dolens.experiments.running.recorded_run import RecordedRun
 
 # What decides the work of a run, and not what is evaluated.
@@ -33,10 +33,9 @@ def refuse_other_work(overrides: Sequence[str]) -> None:
     Raises:
         InputError: for the first of them; or an override cannot be read, or is a sweep.
     """
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise InputError(one_line(error)) from None
+    for text in overrides:
+        read_override(text)
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
     for override in parsed:
         key = override.key_or_group
         if override.is_sweep_override():

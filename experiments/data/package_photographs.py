@@ -1,6 +1,5 @@
 """Photographs of installed packages are found by path, and verified by hash."""
 
-import csv
 import hashlib
 import os
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from dolens.experiments.data.camera_data import CropDataModule, Split
 from dolens.experiments.data.crops import linear_light
 from dolens.experiments.data.photographs import Photograph, read_photograph
 from dolens.experiments.data.photos import TRAIN, read_installed
+from dolens.experiments.tables import read_table
 from dolens.sensor.colour import linear_to_srgb
 
 MANIFEST = Path(__file__).with_suffix(".csv")
@@ -114,13 +114,9 @@ def read_manifest(path: Path) -> list[Entry]:
         InputError: the file is missing, has other columns, an unknown split, a path that leaves the
             folder, a path or hash that stands twice, or a split without photographs.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise InputError(f"data.manifest: {path} does not exist")
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != _COLUMNS:
-            raise InputError(f"{path}: columns {reader.fieldnames}; allowed: {', '.join(_COLUMNS)}")
-        rows = list(reader)
+    rows = read_table(path, _COLUMNS)
     entries = [_entry(path, line, row) for line, row in enumerate(rows, start=2)]
     for name in ("path", "sha256"):
         seen: set[str] = set()
@@ -177,7 +173,7 @@ def shrunk(photograph: Photograph, least: int) -> Photograph:
 
 
 def _entry(path: Path, line: int, row: dict[str, str]) -> Entry:
-    if None in row or None in row.values():
+    if row.keys() != set(_COLUMNS) or None in row.values():
         raise InputError(f"{path}, line {line}: {len(_COLUMNS)} values are needed")
     entry = Entry(**row)
     if entry.split not in get_args(Split):
@@ -193,4 +189,4 @@ def _entry(path: Path, line: int, row: dict[str, str]) -> Entry:
 
 
 def _first(entry: Entry, folders: Sequence[Path]) -> Path | None:
-    return next((f / entry.path for f in folders if (f / entry.path).is_file()), None)
+    return next((f / entry.path for f in folders if os.path.isfile(f / entry.path)), None)

@@ -11,6 +11,7 @@ from dolens.alignment.chart_model import ChartModel
 from dolens.alignment.mark_windows import MarkWindows
 from dolens.experiments.poses.chart_restoration import ARMS
 from dolens.experiments.poses.chart_result import FittedSpecimen, restored
+from dolens.plotting.captions import plain_text
 from dolens.plotting.style import PAGE, SMALL, colours, open_axes
 from dolens.plotting.titles import draw_title
 from dolens.rendering.binning import bin_rays
@@ -127,7 +128,9 @@ def intervals_figure(fits: Sequence[tuple[int, ChartFit]], title: str) -> Figure
             markersize=4,
             label=f"{count} photograph{'s' if count > 1 else ''}",
         )
-    axes.set_yticks(range(len(names)), [parameter_label(name) for name in names], fontsize=SMALL)
+    axes.set_yticks(
+        range(len(names)), [plain_text(parameter_label(name)) for name in names], fontsize=SMALL
+    )
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xscale("log")
     axes.axvline(1.0, color="0.6", linewidth=0.8)
@@ -159,7 +162,9 @@ def coverage_figure(specimens: Sequence[FittedSpecimen], title: str) -> Figure:
         )
     reach = max(3.2, 1.05 * float(off.abs().max()))
     axes.set_xlim(-reach, reach)
-    axes.set_yticks(range(len(names)), [parameter_label(n) for n in names], fontsize=SMALL - 1)
+    axes.set_yticks(
+        range(len(names)), [plain_text(parameter_label(n)) for n in names], fontsize=SMALL - 1
+    )
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("error over standard error (no unit)", fontsize=SMALL + 1)
     axes.annotate(

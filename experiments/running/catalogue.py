@@ -49,6 +49,16 @@ def configuration_folders(working_folder: Path) -> list[Path]:
     return [*([own] if own else []), packaged_configuration()]
 
 
+def added_folders(arguments: Sequence[str]) -> list[Path]:
+    """Return the folder of `--config-dir`, where it is given."""
+    for place, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if option in ("--config-dir", "-cd"):
+            text = value if equals else next(iter(arguments[place + 1 :]), "")
+            return [Path(text)] if Path(text).is_dir() else []
+    return []
+
+
 def groups(folders: Sequence[Path]) -> dict[str, list[str]]:
     """Return the options of each group, both sorted by name.
 

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.choices import no_choice
+from dolens.experiments.running.command_line import prepared
 from dolens.experiments.running.failed_parts import reason_of
 from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.processes import own_arguments, report_failure
@@ -44,6 +45,8 @@ def main(arguments: Sequence[str], program: str) -> None:
     use_working_folder()
     start = hydra.main(str(packaged_configuration()), "train", version_base="1.3")(job)
     try:
+        sys.argv = [program]  # Hydra's parser of options is named by it
+        arguments = prepared(arguments, program)
         with own_arguments(arguments) as own:
             sys.argv = [program, *own]
             start()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.tolerances.tables import per_unit
+from dolens.plotting.captions import plain_text
 from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
@@ -36,7 +37,7 @@ def tolerance_figures(
     spots = list(spots)
     blocks = [("x", len(spots)), ("y", len(spots))]
     motion = s.centroid_jacobian.transpose(0, 1).flatten(0, 1)
-    labels = [parameter_label(parameter) for parameter in t.names]
+    labels = [plain_text(parameter_label(parameter)) for parameter in t.names]
     with_tolerance = [tolerance_label(n, t.label(p)) for p, n in enumerate(t.names)]
     scale = 1e3 * per_unit(t)
     first = c.order[:_MOST_OFFENDERS]

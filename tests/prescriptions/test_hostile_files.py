@@ -94,7 +94,7 @@ def test_decimal_numbers_are_numbers(text, value):
         (lens_with("stop: !!set {a}\n"), "could not determine a constructor"),
         (lens_with("name: !!python/name:os.system\n"), "could not determine a constructor"),
         (lens_with("a: &a [*a]\n"), "it means more than 2000000 values"),
-        (lens_with("\x1b[31m: 1\n"), "special characters are not allowed"),
+        (lens_with("\x1b[31m: 1\n"), "control characters are not allowed"),
         (lens_with('"\\e[31m": 1\n'), "unknown key '\\x1b[31m'"),
         (lens_with('"a\\nb": 1\n'), "unknown key 'a b'"),
         ("surfaces: {" + "1: {}, " * 2 + "}", "key '1' is given twice"),

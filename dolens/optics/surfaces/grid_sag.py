@@ -16,6 +16,8 @@ from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.registry import register_surface
 
 _ARRAYS = ("sag", "slope_x", "slope_y", "twist")
+# The slopes of splines through so many nodes are found in a second.
+_MOST_NODES = 2000
 _LENGTHS = ("spacing_x", "spacing_y", "decenter_x", "decenter_y")
 
 
@@ -115,6 +117,10 @@ def with_slopes(parameters: Mapping[str, Any]) -> dict[str, Any]:
     sag = arrays.get("sag")
     if sag is None or sag.dim() != 2 or min(sag.shape) < 2:
         raise InputError("'sag' must be at least 2 rows (y) of at least 2 numbers (x), mm")
+    if max(sag.shape) > _MOST_NODES:
+        raise InputError(
+            f"'sag' has {sag.shape[0]} rows of {sag.shape[1]} numbers (allowed: {_MOST_NODES} each)"
+        )
     for name, array in arrays.items():
         if array.shape != sag.shape:
             raise InputError(

@@ -21,6 +21,8 @@ Covered = Callable[[Tensor], Tensor]
 # Kind, centre and numbers of each figure; see `Figure`.
 Figures = list[tuple[Figure, Point, tuple[float, ...]]]
 CENTRE: Point = (0.0, 0.0)
+# Of all polygons of an outline; light is compared with each side.
+MOST_CORNERS = 10_000
 # mm; the square of a length beyond leaves the range of numbers.
 _LONGEST = 1e100
 
@@ -114,6 +116,11 @@ class Polygons(Composite):
     def __post_init__(self) -> None:
         if not self.polygons:
             raise InputError("'polygons' is empty; it needs lists of at least three points [x, y]")
+        count = sum(map(len, self.polygons))
+        if count > MOST_CORNERS:
+            raise InputError(
+                f"'polygons' have {count} vertices together (allowed: {MOST_CORNERS} at most)"
+            )
         for polygon in self.polygons:
             if len(polygon) < 3 or len(set(polygon)) != len(polygon):
                 raise InputError("a polygon needs at least three vertices, and each of them once")
