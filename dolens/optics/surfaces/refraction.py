@@ -10,7 +10,7 @@ from dolens.kernels.limits import LONGEST, TINY
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
 # mm; tolerances are those of no larger a surface, however far its clear aperture is said to reach.
-_LARGEST = 1e6
+_LARGEST = 1e4
 
 
 def tolerance_scale(semi_diameter: float) -> float:
