@@ -98,4 +98,5 @@ def check_range(value: object, dtype: torch.dtype, where: str, key: str = "") ->
     if most < number < math.inf:
         raise InputError(f"{where}: '{key}' is {value}; {precision} holds {most:.4g} at most")
     if 0.0 < number < least:
-        raise InputError(f"{where}: '{key}' is {value}; {precision} needs {least:.4g} at least")
+        words = f"too small for a surface in {precision}: {least:.4g} at least"
+        raise InputError(f"{where}: '{key}' is {float(value):g}, {words}")  # type: ignore[arg-type]
