@@ -184,7 +184,9 @@ class SearchMerit:
         f = self.specification.focal_length
         shifted = found.deviations + conditions.shifts
         shifted = torch.where(self.is_limit, shifted.clamp(min=0.0), shifted)
-        rows = torch.where((shifted != 0.0)[..., None], found.derivatives, 0.0)
+        # Where a target is met to the last digit, it still binds.
+        binds = ~self.is_limit | (shifted > 0.0)
+        rows = torch.where(binds[..., None], found.derivatives, 0.0)
         spots = self._in_variables(_about_centroids(found.sums), found.of_pupil)
         weight = self.operand_weight**2
         merit = spots.merit / f**2 + weight * shifted.square().sum(-1)

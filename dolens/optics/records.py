@@ -17,7 +17,7 @@ from dolens.optics.elements import carriers
 from dolens.optics.image_surface import WITHOUT_EDGE
 from dolens.optics.record_structure import BREAK, LawForm, Structure
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.surfaces.refraction import FAR
+from dolens.optics.surfaces.refraction import FAR, tolerance_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +230,7 @@ class _Writer:
         values, record = self.constants, row[Code.OFFSET]
         edge, hole, size = aperture.edge, aperture.obscuration, aperture.semi_diameter
         values[record + Slot.LIMIT] = FAR * size
-        values[record + Slot.SCALE] = size
+        values[record + Slot.SCALE] = tolerance_scale(size)
         # A full circle is tested on the way; where there is none it is out of reach.
         values[record + Slot.EDGE] = (2.0 * FAR * size) ** 2
         for outline in (edge, aperture.window):

@@ -18,7 +18,7 @@ from dolens.optics.rays import (
     finite_rays,
 )
 from dolens.optics.surfaces.deflection import Media, Travel
-from dolens.optics.surfaces.refraction import FAR, PlaneRay
+from dolens.optics.surfaces.refraction import FAR, PlaneRay, tolerance_scale
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, per_radian
 
@@ -124,7 +124,8 @@ def meet(
     x = torch.addcmul(ray.x, to_plane, l).clamp(-limit, limit)
     y = torch.addcmul(ray.y, to_plane, m).clamp(-limit, limit)
     at_plane = PlaneRay(x, y, l, m, n)
-    t, branch = shape.intersect(surface.parameters, at_plane, sense, surface.semi_diameter)
+    scale = tolerance_scale(surface.semi_diameter)
+    t, branch = shape.intersect(surface.parameters, at_plane, sense, scale)
     met = towards if branch is None else torch.minimum(towards, branch)
     t = t.clamp(-limit, limit)
     # What was held at the limit is not where the ray goes.

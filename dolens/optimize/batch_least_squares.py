@@ -104,11 +104,13 @@ def minimise_batch(
         initial_damping: ρ of the first step.
 
     Raises:
-        InputError: a lower bound above its upper one, or a tolerance out of range.
+        InputError: no variables, a lower bound above its upper one, or a tolerance out of range.
     """
     if not 0.0 <= merit_tolerance < 1.0:
         raise InputError(f"merit_tolerance must be at least 0 and below 1, not {merit_tolerance}")
     count, size = start.shape
+    if size == 0:
+        raise InputError("least squares: there are no variables")
     lower, upper = lower.expand(count, size), upper.expand(count, size)
     if bool((lower > upper).any()):
         problem, variable = (int(n) for n in torch.nonzero(lower > upper)[0])

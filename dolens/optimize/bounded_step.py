@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optimize.linear_model import LinearModel
 
 # Exchanges of whole blocks without progress before single ones.
@@ -49,8 +50,13 @@ def bounded_step(model: LinearModel, damping: Tensor, lower: Tensor, upper: Tens
         damping: d (P,), positive.
         lower: (P,), at most zero; -inf where there is none.
         upper: (P,), at least zero; inf where there is none.
+
+    Raises:
+        InputError: there are no variables.
     """
     count = len(damping)
+    if count == 0:
+        raise InputError("least squares: there are no variables")
     state = torch.zeros(count, dtype=torch.int8)
     # A bound that the variable sits on, and that the gradient presses it against, is a first guess.
     state[(lower == 0.0) & (model.gradient > 0.0)] = -1

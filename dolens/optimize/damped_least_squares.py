@@ -78,7 +78,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
         max_trials: points evaluated in one step before it gives up.
 
     Raises:
-        InputError: an unknown choice, a tolerance out of range, or bounds that exclude each other.
+        InputError: no variables, an unknown choice, a tolerance out of range, or bounds that
+            exclude each other.
     """
 
     # Its closure returns residuals, unlike every other optimizer's.
@@ -108,13 +109,17 @@ class DampedLeastSquares(torch.optim.Optimizer):
             raise InputError(f"initial_damping must be positive, not {initial_damping}")
         if max_trials < 1:
             raise InputError(f"max_trials must be at least 1, not {max_trials}")
-        super().__init__(params, {"lower": None, "upper": None})
+        given: list[Any] = list(params)
+        # PyTorch refuses an empty list in its own words.
+        super().__init__(given or [{"params": []}], {"lower": None, "upper": None})
         self.damping, self.initial_damping = damping, initial_damping
         self.bounds = bounds
         self.merit_tolerance, self.step_tolerance = merit_tolerance, step_tolerance
         self.gradient_tolerance, self.max_trials = gradient_tolerance, max_trials
         self.last: Iteration | None = None
         self._variables = [p for group in self.param_groups for p in group["params"]]
+        if not sum(variable.numel() for variable in self._variables):
+            raise InputError("least squares: there are no variables")
         self._lower, self._upper = self._bound("lower", -math.inf), self._bound("upper", math.inf)
         empty = self._lower > self._upper
         if bool(empty.any()):
@@ -185,7 +190,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
             ‖r‖² at the point reached.
 
         Raises:
-            InputError: the residuals where the step begins, or their derivatives, are not finite.
+            InputError: there are no residuals, or those where the step begins, or their
+                derivatives, are not finite.
         """
         if self.stopped:
             return torch.tensor(self._memory["merit"], dtype=torch.float64)
@@ -247,6 +253,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
     def _evaluate(self, closure: Callable[[], Tensor | Residuals]) -> Residuals:
         found = closure()
         if isinstance(found, Tensor):
+            if not found.numel():
+                raise InputError("least squares: there are no residuals")
             return TensorResiduals(found, self._variables)
         return found
 

@@ -172,7 +172,11 @@ class MeritValue:
         return torch.stack([part.double() for part in parts]).sum()
 
     def linear_model(self) -> LinearModel:
-        """Return R and b in the variables u."""
+        """Return R and b in the variables u.
+
+        Raises:
+            InputError: there are operands alone, and no variable moves any of them.
+        """
         merit = self._merit
         models: list[LinearModel] = []
         if merit.quality is not None and self.quality is not None:
@@ -185,6 +189,9 @@ class MeritValue:
                 models.append(LinearModel.constant(self.quality.merit, matrix.shape[1]))
         if self._found is not None and self.operands:
             rows = OperandModel.of(self._found, self.operand_derivatives())
+            if merit.quality is None and not bool(rows.derivatives.any()):
+                labels = ", ".join(self._found.labels)
+                raise InputError(f"merit.operands: no variable moves {labels}")
             models.append(rows.near(rows.values.new_zeros(rows.derivatives.shape[1])))
         return LinearModel.join(models)
 

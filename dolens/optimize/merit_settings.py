@@ -21,7 +21,7 @@ from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
 from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operands import Operand, operand
+from dolens.optimize.operands import MOST_WEIGHT, Operand, check_angles, operand
 from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
 from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
@@ -123,6 +123,7 @@ class MeritSettings:
                     raise InputError(
                         f"merit.fields: {list(point)}; allowed: (x, y) in degrees or mm"
                     )
+            check_angles(self.fields, lens, "merit.fields")
             return self.fields
         if lens.fields is None:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
@@ -252,7 +253,9 @@ def _given(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _weights(what: str, given: Sequence[float] | None, count: int) -> Tensor:
     weights = torch.tensor([1.0] * count if given is None else list(given), dtype=torch.float64)
-    bad = not bool(((weights >= 0.0) & weights.isfinite()).all())
+    bad = not bool(((weights >= 0.0) & (weights <= MOST_WEIGHT)).all())
     if len(weights) != count or bad or not float(weights.sum()) > 0.0:
-        raise InputError(f"merit.{what}: give {count} numbers that are not negative, not all zero")
+        raise InputError(
+            f"merit.{what}: give {count} numbers from 0 to {MOST_WEIGHT:g}, not all zero"
+        )
     return weights

@@ -72,9 +72,9 @@ class OperandValues:
 
         Each value takes one reverse sweep.
         """
-        if not self.tensors:
+        if not any(value.requires_grad for value in self.tensors):
             count = sum(leaf.numel() for leaf in leaves)
-            return torch.zeros(0, count, dtype=torch.float64)
+            return torch.zeros(len(self.tensors), count, dtype=torch.float64)
         with torch.enable_grad():
             values = torch.stack([value.reshape(()) for value in self.tensors])
             return jacobian_of(values, list(leaves)).double().cpu()

@@ -28,6 +28,10 @@ from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor
 _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps", "state")
 
 
+# Weights are squared, and their squares summed.
+MOST_WEIGHT = 1e100
+
+
 class UnreachableField(ArithmeticError):
     """Says that the chief ray of a field does not reach the stop, so that the lens cannot be
     judged.
@@ -138,8 +142,10 @@ class Operand:
             raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
         if self.min is not None and self.max is not None and self.min > self.max:
             raise InputError(f"{where}: min exceeds max")
-        if not self.weight > 0.0:
-            raise InputError(f"{where}: weight must be positive, not {self.weight:g}")
+        if not 0.0 < self.weight <= MOST_WEIGHT:
+            raise InputError(
+                f"{where}: weight must be positive, to {MOST_WEIGHT:g}, not {self.weight:g}"
+            )
         if len(self.field) != 2:
             raise InputError(f"{where}: field is x and y, not {self.field}")
 
@@ -183,6 +189,7 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     field = [_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0)]
     if len(field) != 2:
         raise InputError(f"operand '{kind}': field is x and y, not {field}")
+    check_angles([field], lens, f"operand '{kind}': field")
     gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
@@ -195,6 +202,13 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         for state in states:
             check_state(lens, state)
     return Operand(kind, target, low, high, weight, (field[0], field[1]), gaps, states)
+
+
+def check_angles(fields: Sequence[Sequence[float]], lens: Lens, what: str) -> None:
+    """Refuse fields of an object at infinity that are not within 90° of the axis."""
+    for field in fields if lens.object_distance is None else ():
+        if not all(abs(angle) < 90.0 for angle in field):
+            raise InputError(f"{what}: {list(field)} degrees; allowed: between -90 and 90")
 
 
 def _number(value: Any, what: str) -> float:

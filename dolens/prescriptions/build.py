@@ -48,6 +48,7 @@ from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
+    check_range,
     require_mapping,
 )
 from dolens.prescriptions.curvatures import curvature_from, curvature_row, radius_key
@@ -116,6 +117,7 @@ def lens_from_prescription(
     """
     require_mapping(prescription, where)
     check_keys(prescription, _LENS_KEYS, where)
+    check_range(prescription, dtype, where)
     name = str(prescription.get("name", where))
     try:
         model = find_index_model(index_model or str(prescription.get("index_model", "dfc")))

@@ -1,12 +1,16 @@
 """The CPU kernels of surfaces given by their sag answer to the reference."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from dolens import Rays
 from dolens.optics.jacobian import ray_jacobian
+from dolens.optics.surfaces.clear_aperture import Circle
 from tests.kernels.trace_cases import (
     LENSES,
+    _random,
     bundle,
     require_equal,
     require_no_worse,
@@ -50,3 +54,56 @@ def test_its_jacobian_is_that_of_the_reference(name, root):
     size = found[1].derivatives.abs().amax((0, 1) if found[1].derivatives.dim() == 3 else 0)
     error = (found[0].derivatives - found[1].derivatives).abs()
     assert (error <= 1e-10 * (1.0 + size)).all()
+
+
+@CASES
+def test_a_semi_diameter_without_end_costs_no_digits(name, root):
+    """Newton's iteration ends by lengths of the beam, not of an aperture that nothing reaches."""
+    lens = LENSES[name](root)
+    rays = bundle(lens, 40, fill=0.8)
+    expected = traced(lens, rays, "reference")
+    for surface in lens.surfaces.values():
+        surface.aperture = replace(surface.aperture, edge=Circle(1e16))
+    for backend in ("reference", "cpu"):
+        found = traced(lens, rays, backend)
+        both = expected.valid & found.valid
+        assert both.sum() > 20
+        assert (found.position - expected.position)[both].abs().max() < 1e-11
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_ray_through_the_vertices_has_finite_gradients(name, dtype, root):
+    """One along the axis, and two askew through the first vertex."""
+    lens = LENSES[name](root)
+    lens = lens.to(dtype).to(torch.float64)
+    position = torch.tensor([[0.0, 0.0, -10.0], [0.0, 0.5, -10.0], [0.3, 0.5, -10.0]]).double()
+    rays = Rays(position, -position / position.norm(dim=-1, keepdim=True), 550.0)
+    expected, found = (traced(lens, rays, b, dtype=dtype) for b in ("reference", "cpu"))
+    assert torch.equal(found.status, expected.status)
+    single = dtype == torch.float32
+    # Of a tilt about the axis itself what is left of large terms counts.
+    for parameter, gradient in expected.gradients.items():
+        assert torch.isfinite(gradient).all(), parameter
+        error = (found.gradients[parameter] - gradient).abs().max()
+        assert error <= (2e-3 if single else 1e-11) * (1e-3 + gradient.abs().max()), parameter
+    # The first of the odd aspheres has a tip, where nothing has a slope.
+    if not single and name != "odd_aspheres":
+        require_slopes(lens, rays, expected)
+
+
+def require_slopes(lens, rays, expected):
+    """Derivatives with respect to where the rays start are central differences of the values."""
+    step, weights = 1e-5, _random(len(rays.position), 7, seed=5)
+    for axis in range(3):
+        shift = torch.zeros(3, dtype=torch.float64)
+        shift[axis] = step
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = Rays(rays.position + sign * shift, rays.direction, rays.wavelength)
+            hit = lens.trace(moved)
+            outputs = torch.cat((hit.position, hit.direction, hit.path_length[..., None]), -1)
+            ends.append((outputs.detach() * weights).sum(-1))
+        slope = (ends[0] - ends[1]) / (2.0 * step)
+        error = (slope - expected.gradients["position"][:, axis])[expected.valid].abs().max()
+        assert error < 1e-6 * (1.0 + slope.abs().max())

@@ -7,6 +7,9 @@ from dolens import Rays, load_lens
 from dolens.errors import InputError
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optimize import DampedLeastSquares
+from dolens.optimize.batch_least_squares import BatchModel, minimise_batch
+from dolens.optimize.bounded_step import bounded_step
+from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.residuals import TensorResiduals, _say_reverse
 from tests.optimize.standard_problems import CERTIFIED, MORE
 
@@ -282,3 +285,20 @@ def triplet_residuals(root):
         return trace_rays(system, rays).position[:, :2].reshape(-1)
 
     return residuals, lens.surfaces["1"].curvature.detach().clone().requires_grad_(), 1e-6
+
+
+def test_problems_without_variables_or_residuals_are_named():
+    none = torch.zeros(0, dtype=torch.float64)
+    model = LinearModel(1.0, torch.zeros(3, 0).double(), torch.ones(3).double())
+    nothing = BatchModel(torch.ones(2).double(), none.expand(2, 0), torch.zeros(2, 0, 0).double())
+    for call in (
+        lambda: DampedLeastSquares([]),
+        lambda: DampedLeastSquares([none.requires_grad_()]),
+        lambda: minimise_batch(lambda *_: nothing, none.expand(2, 0), none, none, 3),
+        lambda: bounded_step(model, none, none, none),
+    ):
+        with pytest.raises(InputError, match=r"^least squares: there are no variables$"):
+            call()
+    u = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    with pytest.raises(InputError, match=r"^least squares: there are no residuals$"):
+        DampedLeastSquares([u]).step(lambda: u[:0])

@@ -13,7 +13,7 @@ from dolens.analysis.pupil_quadrature import (
     with_chief_rays,
 )
 from dolens.errors import InputError
-from dolens.optimize import DesignVariables, MeritSettings
+from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
 from dolens.optimize.merit_settings import LOSSES
@@ -320,3 +320,29 @@ def test_bad_operands_are_refused(triplet, settings, said):
 def test_bad_pickups_and_solves_are_refused(triplet, variables, said):
     with pytest.raises(InputError, match=said):
         DesignVariables(triplet, variables)
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"operands": [{"kind": "efl", "target": 50.0, "weight": 1e300}]}, "weight must be"),
+        (
+            {"operands": [{"kind": "distortion", "target": 0.0, "field": [0.0, 1e9]}]},
+            r"operand 'distortion': field: \[0.0, 1000000000.0\] degrees; allowed",
+        ),
+        ({"fields": [[0.0, 1e9]]}, r"merit.fields: \[0.0, 1000000000.0\] degrees; allowed"),
+        ({"field_weights": [1e300, 1.0]}, "merit.field_weights: give 2 numbers from 0 to 1e"),
+    ],
+)
+def test_numbers_out_of_all_proportion_are_named(triplet, options, words):
+    with pytest.raises(InputError, match=words):
+        merit_of(triplet, **options)
+
+
+def test_operands_that_no_variable_moves_are_named(triplet):
+    """A thickness does not follow from a curvature."""
+    merit, variables = merit_of(
+        triplet, quality=None, operands=[{"kind": "total_track", "target": 60.0}]
+    )
+    with pytest.raises(InputError, match=r"^merit.operands: no variable moves total_track$"):
+        DampedLeastSquares([variables.scaled]).step(merit)

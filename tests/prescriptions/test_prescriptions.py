@@ -234,3 +234,37 @@ def test_another_kind_of_file(tmp_path):
     with pytest.raises(InputError, match=r"lens files end in \.yaml") as error:
         load_lens(path)
     one_line(error, path)
+
+
+BEYOND_SINGLE = {
+    "thickness": ("surfaces", "1", "thickness", -1e308),
+    "semi-diameter": ("surfaces", "1", "semi_diameter", 1e39),
+    "radius": ("surfaces", "1", "radius", 1e-21),  # its curvature's square is beyond
+    "index": ("surfaces", "1", "material", "1e39"),
+    "sensor": ("sensor", "distance", 1e39),
+    "asphere": ("surfaces", "1", {"type": "even_asphere", "a4": 1e39}),
+    "pose": ("elements", {"1": {"surfaces": [1, 2], "shift_z": 1e39}}),
+    "break": ("surfaces", "1", {"type": "coordinate_break", "decenter_x": 1e39, "thickness": 0.0}),
+    "spline": ("surfaces", "1", {"type": "b_spline", "coefficients": [[0.0, 1e39]]}),
+    "field": ("fields", {"angles": [[0.0, 1e39]]}),
+}
+
+
+@pytest.mark.parametrize("case", BEYOND_SINGLE)
+def test_what_single_precision_cannot_hold_is_refused_and_named(case):
+    *keys, last = BEYOND_SINGLE[case]
+    lens = {"surfaces": {"1": {"radius": 50.0, "semi_diameter": 5.0, "thickness": 3.0,
+                               "material": "1.5"},
+                         "2": {"radius": -50.0, "semi_diameter": 5.0, "material": "air"}},
+            "sensor": {"distance": 40.0}}  # fmt: skip
+    row = lens
+    for key in keys[:-1]:
+        row = row[key]
+    row[keys[-1]] = last
+    text = r"1e\+39|1e39|1e-21|-1e\+308"
+    place = "surface 1: " if keys[0] == "surfaces" else keys[0] if keys[0] != "fields" else ""
+    with pytest.raises(
+        InputError, match=rf"^lens: {place}.*'\w+' is ({text})[;,] .*float32"
+    ) as refused:
+        lens_from_prescription(lens, torch.float32)
+    assert "\n" not in str(refused.value)

@@ -17,6 +17,9 @@ from dolens.errors import InputError
 _SAME_FACE = 1e-9
 # Directions in which a set extends by less than this, in units of the coordinates, are flat.
 _FLAT = 1e-6
+# The outermost glasses lie on faces to within rounding, and no step may hang on that: a glass this
+# near to a face leans on it.
+_ON_FACE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -35,19 +38,21 @@ class GlassRegion:
         """Return A x - b, (..., F): the distances beyond the faces, negative inside."""
         return coordinates @ self.normals.T - self.bounds
 
-    def contains(self, coordinates: Tensor, tolerance: float = 1e-9) -> Tensor:
+    def contains(self, coordinates: Tensor, tolerance: float = _ON_FACE) -> Tensor:
         """Return whether glasses (..., C) lie in the region, (...)."""
         return (self.excess(coordinates) <= tolerance).all(-1)
 
     def hinges(self, coordinates: Tensor, margin: float = 0.0) -> tuple[Tensor, Tensor]:
         """Return max(0, A x - b - margin), (..., F), and its derivative, (..., F, C).
 
+        On a face the derivative is that beyond it, so that a first step meets a wall there.
+
         As residuals, a row a face, they keep a glass in the region; a positive margin lets it go
         that far beyond.
         """
         excess = self.excess(coordinates) - margin
-        beyond = excess > 0.0
-        return excess.clamp(min=0.0), beyond[..., None] * self.normals
+        leans = excess > -_ON_FACE
+        return excess.clamp(min=0.0), leans[..., None] * self.normals
 
     def penalty(self, coordinates: Tensor, margin: float = 0.0) -> tuple[Tensor, Tensor]:
         """Return the root of the sum of the squared hinges, (...), and its derivative, (..., C).

@@ -9,6 +9,13 @@ from dolens.kernels.limits import LONGEST, TINY
 
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
+# mm; tolerances are those of no larger a surface, however far its clear aperture is said to reach.
+_LARGEST = 1e4
+
+
+def tolerance_scale(semi_diameter: float) -> float:
+    """Return the length, mm, that tolerances of a surface's intercepts are shares of."""
+    return min(semi_diameter, _LARGEST)
 
 
 class PlaneRay(NamedTuple):

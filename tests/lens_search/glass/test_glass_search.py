@@ -5,15 +5,19 @@ import math
 import pytest
 import torch
 
+from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.glass.choice import GlassChoice
 from dolens.lens_search.glass.glass_merit import GlassMerit
 from dolens.lens_search.glass.glass_set import chosen_glasses
 from dolens.lens_search.glass.glass_step import GlassPlan
+from dolens.lens_search.glass.own_glasses import FREE
 from dolens.lens_search.glass.thin_achromats import best_achromats
 from dolens.lens_search.glass.trial_glasses import SnapSettings
+from dolens.lens_search.growth import grow
 from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.search import SearchPlan, Stage, search, with_step
 from dolens.lens_search.specification import Limits, Specification
+from dolens.lens_search.starts import random_starts
 from dolens.tasks import in_turn
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -38,7 +42,7 @@ PLAN = SearchPlan(
     finish_iterations=20,
     rings=2,
     arms=4,
-    glass=GlassPlan(forms=1, snapping=SnapSettings(far=8, neighbours=3, rounds=2), rings=2, arms=4),
+    glass=GlassPlan(forms=2, snapping=SnapSettings(far=8, neighbours=3, rounds=2), rings=2, arms=4),
 )
 
 
@@ -77,3 +81,16 @@ def test_what_real_glasses_cost_is_a_number(found):
     _, losses = found
     assert losses and all(math.isfinite(loss) and loss > -0.5 for loss in losses)
     assert torch.tensor(losses).min() < 0.2
+
+
+def test_rounding_does_not_choose_the_way_of_a_descent():
+    """Starts meet their focal length to the last digit, in glasses on walls of the region."""
+    arrangement = Arrangement.of(OBJECTIVE, *OBJECTIVE.places_of_stop[0])
+    merit = merit_of(arrangement, OBJECTIVE, 3, 6)
+    generator = torch.Generator().manual_seed(0)
+    starts = random_starts(merit, 24, generator)
+    noise = 1e-14 * torch.randn(starts.shape, generator=generator, dtype=torch.float64)
+    rounded = torch.where(starts == FREE, starts, starts * (1.0 + noise))
+    stage = (Stage(1.0, 1.0, iterations=10),)
+    one, other = (grow(merit, values, stage) for values in (starts, rounded))
+    torch.testing.assert_close(one.values, other.values, rtol=0.0, atol=1e-7)
