@@ -1,6 +1,7 @@
 """Decimal text and double precision are converted to each other without losing a bit."""
 
 import math
+import re
 from decimal import Context, Decimal
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ _DIGITS_OF_A_DOUBLE = 17
 _RECIPROCAL = Context(prec=40)
 # Longer text is no number that a program writes, and is slow to read.
 _LONGEST = 400
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", re.ASCII)
 
 
 def number_in_text(text: str, place: str) -> float:
@@ -20,7 +22,9 @@ def number_in_text(text: str, place: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise InputError(f"{place} must be a number, not '{text}'") from None
+        comma = _DECIMAL_COMMA.fullmatch(text.strip())
+        hint = " (it has a decimal comma; write a point)" if comma else ""
+        raise InputError(f"{place} must be a number, not '{text}'{hint}") from None
     if not math.isfinite(value) or "_" in text:
         raise InputError(f"{place} must be a finite number, not '{text}'")
     return value

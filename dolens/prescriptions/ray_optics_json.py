@@ -52,6 +52,9 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
     finite = abs(lengths[0]) < _INFINITE
     prescription |= _specification(model, finite, where)
     prescription["object_material"] = media[0]
+    target = _object(interfaces[0], f"{where}: the object")
+    if finite and _shape(target, profiles, f"{where}: the object")["type"] != "plane":
+        raise InputError(f"{where}: the object: a curved object is not held")
     if finite:
         prescription["object_distance"] = lengths[0]
     stop = sequence.get("stop_surface")
