@@ -222,7 +222,10 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
         value = round(number(wave, "value", where) * _NM[unit], 9)
         values.append(value)
         weights.append(number(wave, "weight", where, 1.0))
-        primary = value if wave.get("is_primary") else primary
+        if wave.get("is_primary"):
+            if primary is not None:
+                raise InputError(f"{where}: two wavelengths are primary ('is_primary')")
+            primary = value
     if not values:
         return {}
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}

@@ -1,16 +1,23 @@
 """What a lens file holds is used, refused or listed as passed over; no key is read by nobody."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.prescriptions.build import lens_from_prescription, prescription_of
+from dolens.prescriptions.build import prescription_of
 from dolens.prescriptions.json_lenses import read_json
+from dolens.prescriptions.lens_formats import read_lens
+from tests.prescriptions.codev_samples import TRIPLET as CODE_V_TRIPLET
+from tests.prescriptions.test_oslo import TRIPLET as OSLO_TRIPLET
 
 PEERS = Path(__file__).parent / "peer_files"
+# A longer distance is infinite.
+FAR = 1e10
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![\w.])")
 # Classes of a program's own objects, beside which its values stand.
 WRAPPERS = ("__instance_type__", "attributes")
 
@@ -28,14 +35,15 @@ def leaves(content, place=()):
 def other(value):
     if isinstance(value, bool):
         return not value
-    return f"{value}x" if isinstance(value, str) else 1.01 * value + 0.01
+    if isinstance(value, str):
+        return f"{value}x"
+    return 1.01 * value + 0.01 if abs(value) < FAR else -3.0
 
 
 def fingerprint(content):
-    """Return the lens that a file means and what is passed over; None where it is refused."""
+    """Return a file's prescription and what is passed over; None where it is refused."""
     try:
-        prescription, listed = read_json(json.dumps(content), "lens")
-        return prescription_of(lens_from_prescription(prescription)), listed
+        return read_json(json.dumps(content), "lens")
     except InputError:
         return None
 
@@ -63,6 +71,40 @@ def unnoticed(content):
 @pytest.mark.parametrize("name", ["optiland_rich.json", "ray_optics_rich.roa"])
 def test_each_key_is_used_refused_or_listed(name):
     assert unnoticed(json.loads((PEERS / name).read_text())) == []
+
+
+# Lines without optical effect: comments, counts, sizes for drawing, and what solves came from.
+@pytest.mark.parametrize(
+    ("name", "text", "silent"),
+    [
+        ("a.len", OSLO_TRIPLET, r"//|NXT|LEN NEW|AP   |CBK|DLRS|END|PY|V "),
+        ("a.seq", CODE_V_TRIPLET, r"RDM;LEN|  CCY"),
+    ],
+)
+def test_each_number_of_a_text_is_used_refused_or_listed(name, text, silent):
+    before, missed, at = read_lens(text.encode(), Path(name)), [], 0
+    for line in text.splitlines(keepends=True):
+        for found in NUMBER.finditer(line) if not re.match(silent, line) else ():
+            whole = found[0].lstrip("-").isdecimal()
+            changed = other(int(found[0]) if whole else float(found[0]))
+            begin, end = at + found.start(), at + found.end()
+            put = f"{text[:begin]}{int(changed) + 1 if whole else changed!r}{text[end:]}"
+            try:
+                if read_lens(put.encode(), Path(name)) == before:
+                    missed.append((line, found[0]))
+            except InputError:
+                pass
+        at += len(line)
+    assert missed == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "old"),
+    [("a.len", OSLO_TRIPLET, "22.014"), ("a.seq", CODE_V_TRIPLET, "22.014")],
+)
+def test_a_decimal_comma_is_named(name, text, old):
+    with pytest.raises(InputError, match="comma"):
+        read_lens(text.replace(old, "22,014").encode(), Path(name))
 
 
 def test_a_mirror_of_optiland_reflects():
