@@ -15,6 +15,12 @@ _LONGEST = 400
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", re.ASCII)
 
 
+def comma_hint(value: object) -> str:
+    """Return what to say of a number with a decimal comma, such as `1,5`; empty for all else."""
+    comma = isinstance(value, str) and _DECIMAL_COMMA.fullmatch(value.strip())
+    return " (it has a decimal comma; write a point)" if comma else ""
+
+
 def number_in_text(text: str, place: str) -> float:
     """Read a finite number as files write it (`1.5`, `-2E-3`); `InputError` names the place."""
     if len(text) > _LONGEST:
@@ -22,9 +28,7 @@ def number_in_text(text: str, place: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        comma = _DECIMAL_COMMA.fullmatch(text.strip())
-        hint = " (it has a decimal comma; write a point)" if comma else ""
-        raise InputError(f"{place} must be a number, not '{text}'{hint}") from None
+        raise InputError(f"{place} must be a number, not '{text}'{comma_hint(text)}") from None
     if not math.isfinite(value) or "_" in text:
         raise InputError(f"{place} must be a finite number, not '{text}'")
     return value
