@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.prescriptions.decimals import comma_hint
 
 
 def as_number(value: object, what: str, finite: bool = True) -> float:
@@ -18,7 +19,7 @@ def as_number(value: object, what: str, finite: bool = True) -> float:
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} must be a number, not {value!r}") from None
+        raise InputError(f"{what} must be a number, not {value!r}{comma_hint(value)}") from None
     if math.isnan(number) or (finite and math.isinf(number)):
         raise InputError(f"{what} must be a finite number, not {value!r}")
     return number

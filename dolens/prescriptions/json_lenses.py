@@ -12,6 +12,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.deeplens_json import read_deeplens
+from dolens.prescriptions.json_values import Watched, passed_over
 from dolens.prescriptions.optiland_json import read_optiland
 from dolens.prescriptions.ray_optics_json import read_ray_optics
 from dolens.prescriptions.read_file import ReadPrescription
@@ -32,7 +33,11 @@ def read_json(text: str, where: str) -> ReadPrescription:
         raise InputError(f"{where}: expected a mapping of keys to values, not {_kind(content)}")
     for holds, read in _READERS:
         if holds(content):
-            return read(content, where)
+            if read is _own:
+                return read(content, where)
+            watched = Watched(content)
+            prescription, more = read(watched, where)
+            return ReadPrescription(prescription, [*more, *passed_over(watched)])
     keys = ", ".join(list(content)[:5]) or "none"
     raise InputError(
         f"{where}: no program that is known here writes lenses with the keys {keys} (allowed: "
@@ -44,6 +49,10 @@ def json_of(prescription: Mapping[str, Any], where: str) -> bytes:
     """Write a prescription as JSON, with the keys that YAML has; reading gives the same bits."""
     text = json.dumps(_written(prescription), indent=2, ensure_ascii=False, allow_nan=False)
     return f"{text}\n".encode()
+
+
+def _own(content: dict[str, Any], where: str) -> ReadPrescription:
+    return ReadPrescription(content, [])
 
 
 def _is_own(content: dict[str, Any]) -> bool:
@@ -68,7 +77,7 @@ def _is_ray_optics(content: dict[str, Any]) -> bool:
 _READERS: tuple[
     tuple[Callable[[dict[str, Any]], bool], Callable[[dict[str, Any], str], ReadPrescription]], ...
 ] = (
-    (_is_own, lambda content, where: ReadPrescription(content, [])),
+    (_is_own, _own),
     (_is_optiland, read_optiland),
     (_is_deeplens, read_deeplens),
     (_is_ray_optics, read_ray_optics),

@@ -27,6 +27,8 @@ _PUPILS = {"EPD": "entrance_pupil_diameter", "imageFNO": "f_number", "objectNA":
 _MAKER = re.compile(r"[\\/](schott|ohara|hoya|cdgm|sumita|hikari)[\\/]", re.IGNORECASE)
 _NM = {"um": 1e3, "nm": 1.0, "mm": 1e6, "m": 1e9}
 _INFINITE = 1e10
+# How light goes on behind a surface: by refraction or reflection, or as an ideal lens sends it.
+_REFRACTS, _IDEAL = "RefractiveReflectiveModel", "ThinLensInteractionModel"
 
 
 def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
@@ -51,6 +53,12 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
     prescription |= _fields(mapping(content.get("fields"), f"{where}: 'fields'"), where)
     prescription |= _pupil(content, where)
     positions = [_position(surface, f"{where}: surface {n}") for n, surface in enumerate(surfaces)]
+    for end, what in ((surfaces[0], "object"), (surfaces[-1], "image")):
+        _require_plain_end(end, f"{where}: the {what}")
+    if math.isfinite(positions[0]):
+        far = mapping(surfaces[0].get("geometry"), f"{where}: the object: 'geometry'")
+        if _shape(far, f"{where}: the object")["type"] != "plane":
+            raise InputError(f"{where}: the object: a curved object is not held")
     prescription["object_material"] = _medium(surfaces[0], f"{where}: surface 0")
     if math.isfinite(positions[0]) and abs(positions[0]) < _INFINITE:
         gap = difference(positions[1], positions[0], where)
@@ -75,15 +83,55 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
     return ReadPrescription(prescription, [])
 
 
+def _require_plain_end(surface: dict[str, Any], place: str) -> None:
+    """Refuse an object or image that sends light on as no dummy surface does."""
+    if surface.get("type") not in ("ObjectSurface", "ImageSurface", "Surface", "StandardSurface"):
+        raise InputError(f"{place}: a surface of type {surface.get('type')!r} is not held")
+    action = mapping(surface.get("interaction_model") or {}, f"{place}: 'interaction_model'")
+    if action.get("type", _REFRACTS) != _REFRACTS or action.get("is_reflective"):
+        raise InputError(f"{place}: an interaction other than refraction is not held")
+
+
 def _row(surface: dict[str, Any], stop: bool, before: str, place: str) -> dict[str, Any]:
     """Return type, radius, coefficients, medium and aperture of a surface."""
     if surface.get("type") not in ("Surface", "StandardSurface"):
         raise InputError(f"{place}: a surface of type {surface.get('type')!r} is not held")
-    material = "mirror" if surface.get("is_reflective") else _medium(surface, place)
-    row = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
+    geometry = mapping(surface.get("geometry"), f"{place}: 'geometry'")
+    action = mapping(surface.get("interaction_model") or {}, f"{place}: 'interaction_model'")
+    # Since 0.5 the interaction says whether a surface reflects, before that the surface itself.
+    reflects = bool(surface.get("is_reflective")) or bool(action.get("is_reflective"))
+    material = "mirror" if reflects else _medium(surface, place)
+    kind = action.get("type", _REFRACTS)
+    if surface.get("surface_type") == "paraxial" or kind == _IDEAL:
+        row = _ideal_lens(surface, action, geometry, reflects, place)
+    elif kind != _REFRACTS:
+        raise InputError(
+            f"{place}: an interaction of type {kind!r} is not held (allowed: {_REFRACTS}, {_IDEAL})"
+        )
+    else:
+        row = _shape(geometry, place)
     if row == {"type": "plane"} and stop and material == before:
         row = {"type": "aperture"}
     return row | {"material": material} | aperture_row(surface.get("aperture"), place)
+
+
+def _ideal_lens(
+    surface: dict[str, Any],
+    action: dict[str, Any],
+    geometry: dict[str, Any],
+    reflects: bool,
+    place: str,
+) -> dict[str, Any]:
+    """Return a thin lens without aberrations, of the focal length f in mm."""
+    if reflects:
+        raise InputError(f"{place}: an ideal mirror (a paraxial surface that reflects) is not held")
+    if _shape(geometry, place)["type"] != "plane":
+        raise InputError(f"{place}: an ideal lens that is not plane is not held")
+    length = next((e[k] for e in (action, surface) for k in ("focal_length", "f") if k in e), None)
+    if length is None:
+        raise InputError(f"{place}: an ideal lens without its 'focal_length'")
+    where = f"{place}: 'focal_length'"
+    return {"type": "paraxial_lens", "focal_length": as_number(_first(length), where, finite=False)}
 
 
 def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
@@ -121,6 +169,9 @@ def _medium(surface: dict[str, Any], place: str) -> str:
     material = mapping(surface.get("material_post"), f"{place}: 'material_post'")
     kind = material.get("type")
     require_unset(material, ("absorp",), "absorption", place)
+    spreading = mapping(material.get("propagation_model") or {}, place).get("class")
+    if spreading not in (None, "HomogeneousPropagation"):
+        raise InputError(f"{place}: a medium with {spreading!r} is not held")
     if kind == "IdealMaterial":
         index = as_number(_first(material.get("index")), f"{place}: 'index'")
         return "air" if index == 1.0 else repr(index)
@@ -172,7 +223,10 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
         value = round(number(wave, "value", where) * _NM[unit], 9)
         values.append(value)
         weights.append(number(wave, "weight", where, 1.0))
-        primary = value if wave.get("is_primary") else primary
+        if wave.get("is_primary"):
+            if primary is not None:
+                raise InputError(f"{where}: two wavelengths are primary ('is_primary')")
+            primary = value
     if not values:
         return {}
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}

@@ -53,6 +53,9 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
     finite = abs(lengths[0]) < _INFINITE
     prescription |= _specification(model, finite, where)
     prescription["object_material"] = media[0]
+    target = _object(interfaces[0], f"{where}: the object")
+    if finite and _shape(target, profiles, f"{where}: the object")["type"] != "plane":
+        raise InputError(f"{where}: the object: a curved object is not held")
     if finite:
         prescription["object_distance"] = lengths[0]
     stop = sequence.get("stop_surface")
@@ -193,17 +196,27 @@ def _specification(model: dict[str, Any], finite: bool, where: str) -> dict[str,
 
 def _key(content: dict[str, Any]) -> tuple[str, ...]:
     words = content.get("key", content.get("_key", []))
-    return tuple(map(str, words[-2:])) if isinstance(words, list) else ()
+    if not isinstance(words, list):
+        return ()
+    # The first of three says that they are of the aperture or the fields.
+    return tuple(map(str, words[1:] if words[:1] in (["aperture"], ["field"]) else words))
+
+
+def _kept(content: dict[str, Any], key: str) -> str:
+    """Return the name under which a value stands: in 0.9.8 some have a line in front."""
+    return f"_{key}" if f"_{key}" in content else key
 
 
 def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     key = _key(content)
     if key not in _FIELDS:
         raise InputError(f"{where}: fields of kind {' '.join(key) or 'none'} are not held")
-    scale = number(content, "value", where) if content.get("is_relative") else 1.0
+    scale = number(content, _kept(content, "value"), where) if content.get("is_relative") else 1.0
     entries = [_object(f, f"{where}: fields") for f in rows(content.get("fields"), where)]
     found: dict[str, Any] = {
-        _FIELDS[key]: [[scale * number(f, axis, where, 0.0) for axis in "xy"] for f in entries]
+        _FIELDS[key]: [
+            [scale * number(f, _kept(f, axis), where, 0.0) for axis in "xy"] for f in entries
+        ]
     }
     cut = []
     for f in entries:

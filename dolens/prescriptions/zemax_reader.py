@@ -268,8 +268,10 @@ def _object(
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
     # On the axis a curved object is where a plane is.
-    if block.type != "STANDARD" or (block.curvature != 0.0 and not is_axial(file, where)):
-        raise InputError(f"{place}: must be a plane of TYPE STANDARD")
+    if block.type != "STANDARD":
+        raise InputError(f"{place}: must be a plane of TYPE STANDARD, not {block.type}")
+    if block.curvature != 0.0 and not is_axial(file, where):
+        raise InputError(f"{place}: a curved object is not held (CURV)")
     if any(own_axes(block)):
         raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")
     medium = glass(block.words("GLAS"), place=place)

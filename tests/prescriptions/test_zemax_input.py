@@ -88,7 +88,7 @@ BAD = {
     "aspheric image": (singlet(*GOOD, image="TYPE EVENASPH\n  CURV 0.1\n  PARM 2 1e-5"),
                        "the image: an aspheric image is not held"),
     "round object": (singlet(*GOOD, head="FLOA\nYFLN 3\n").replace("SURF 1", "  CURV 0.1\nSURF 1"),
-                     "the object: must be a plane"),
+                     "the object: a curved object is not held (CURV)"),
     "primary wavelength": (singlet(*GOOD, head="WAVM 1 0.55 1\nPWAV 2\n"),
                            "PWAV 2 is none of the wavelengths 1 to 1"),
     "heights at infinity": (singlet(*GOOD, head="FTYP 1 0 1 1\nYFLN 5\n"),
