@@ -101,7 +101,7 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or is too small; or the depth lies in the lens.
         """
-        picture = read_picture(file)
+        picture = read_picture(file, self.options.megapixels)
         for note in picture.notes:
             logger.warning("%s: %s", file, note)
         _check_size(file, picture.linear.shape[-2:])
@@ -147,7 +147,7 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or has other channels than the run's sensor.
         """
-        array = read_array(file)
+        array = read_array(file, self.options.megapixels)
         _check_size(file, array.shape[:2])
         readout = self.camera.views.readout
         signal = signal_of(array, readout, file, self.options.black_level, self.options.white_level)

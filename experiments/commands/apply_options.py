@@ -8,6 +8,7 @@ from dolens.experiments.camera.restored_windows import (
     DEFAULT_WINDOW,
     GRID,
 )
+from dolens.sensor.image_files import MEGAPIXELS
 
 _FORMATS = ("png", "tif")
 
@@ -28,6 +29,7 @@ class Options:
         raw: whether the files are what a real sensor gave.
         black_level: of raw files, in their own numbers; None: the run's readout's.
         white_level: likewise.
+        megapixels: the largest picture that is read, millions of pixels.
 
     Raises:
         InputError: a value that is not allowed.
@@ -44,6 +46,7 @@ class Options:
     raw: bool = False
     black_level: float | None = None
     white_level: float | None = None
+    megapixels: float = MEGAPIXELS
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
