@@ -13,7 +13,9 @@ def apply(
     run: Annotated[str, typer.Argument(help="The folder of the run.", metavar="RUN")],
     pictures: Annotated[
         list[Path],
-        typer.Argument(help="PNG, TIFF, JPEG, BMP, GIF, PPM or WebP, 8 or 16 bits.", metavar="PICTURE..."),
+        typer.Argument(
+            help="PNG, TIFF, JPEG, BMP, GIF, PPM or WebP, 8 or 16 bits.", metavar="PICTURE..."
+        ),
     ],
     depth: Annotated[
         list[float] | None,

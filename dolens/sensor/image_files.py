@@ -71,13 +71,15 @@ def format_of(path: str | Path) -> str:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; allowed: an image of {FORMATS}") from None
     except (OSError, ValueError) as error:  # of a name that no file can have too
-        raise InputError(f"{path}: cannot be read ({reason_of(error)})") from None
+        raise InputError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from None
     if begin.startswith(_NUMPY):
         return ".npy"
     for starts, kind, _ in _OPENERS:
         if begin.startswith(starts) and (kind != "WebP" or begin[8:12] == b"WEBP"):
             return kind
-    raise InputError(f"{path}: is no image of these formats; allowed: {FORMATS}")
+    raise InputError(f"{path}: cannot be decoded (no image of these); allowed: {FORMATS}")
 
 
 @contextmanager
@@ -134,9 +136,10 @@ def check_size(path: str | Path, height: int, width: int, megapixels: float) -> 
     if height < 1 or width < 1:
         raise InputError(f"{path}: {width}×{height} pixels; allowed: one or more")
     if height * width > megapixels * 1e6:
+        millions = round(height * width / 1e6, 1)
         raise InputError(
-            f"{path}: {width}×{height} are {height * width / 1e6:.4g} million pixels; allowed: up "
-            f"to {megapixels:g}, the setting megapixels"
+            f"{path}: {width}×{height} are {millions:g} million pixels; allowed: up to "
+            f"{megapixels:g}, the setting megapixels"
         )
 
 

@@ -176,10 +176,7 @@ def test_a_pipe_is_not_waited_for(settled, tmp_path, caplog):
     root = folder(tmp_path / "root")
     os.mkfifo(root / "pipe.png")
     assert data(root).paths and data(root).skipped_files == []
-    assert (
-        f"{root / 'pipe.png'}: not a readable image (is no file; allowed: an image of BMP"
-        in caplog.text
-    )
+    assert f"{root / 'pipe.png'}: not a readable image (is no file" in caplog.text
 
 
 def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatch):
@@ -237,10 +234,10 @@ def test_an_image_bomb_is_one_line_and_no_memory(settled, tmp_path, caplog):
     (root / "bomb.png").write_bytes(bomb())
     module = data(root)
     assert module.paths and module.skipped_files == [root / "bomb.png"]
-    assert "bomb.png: not a readable image (DecompressionBombError" in caplog.text
+    assert "bomb.png: not a readable image (60000×60000 are 3600 million pixels" in caplog.text
     module = data(root, verify=False, validation_fraction=0.01, test_fraction=0.01)
     number = [path.name for path in module.paths["train"]].index("bomb.png")
-    with pytest.raises(InputError, match=r"bomb.png: cannot be decoded .*unreadable=skip"):
+    with pytest.raises(InputError, match=r"bomb.png: 60000×60000 are .*unreadable=skip"):
         module.photographs("train")[number]
 
 
