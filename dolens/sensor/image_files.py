@@ -64,16 +64,19 @@ def format_of(path: str | Path) -> str:
             cannot be opened, or it has another format.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise InputError(f"{path}: is no file; allowed: an image of {FORMATS}")
-        with open(path, "rb") as file:
-            begin = file.read(16)
+        regular = stat.S_ISREG(os.stat(path).st_mode)
+        begin = b""
+        if regular:
+            with open(path, "rb") as file:
+                begin = file.read(16)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; allowed: an image of {FORMATS}") from None
     except (OSError, ValueError) as error:  # of a name that no file can have too
         raise InputError(
             f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
         ) from None
+    if not regular:
+        raise InputError(f"{path}: is no file; allowed: an image of {FORMATS}")
     if begin.startswith(_NUMPY):
         return ".npy"
     for starts, kind, _ in _OPENERS:
