@@ -148,7 +148,9 @@ def _print_table(console: "Console", table: "Table") -> None:
 
     def least(columns: list[int]) -> int:
         wide = console.options.update(max_width=1000)
-        return console.measure(_rich_table(table, columns), options=wide).minimum
+        found = console.measure(_rich_table(table, columns), options=wide)
+        # Lists may go on in further lines; all else is printed as long as it is.
+        return found.minimum if table.listed & {*columns} else found.maximum
 
     parts = [[0]]
     for column in range(1, len(table.heads)):
