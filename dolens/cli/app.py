@@ -33,12 +33,19 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command; a user's mistake ends it with one line and exit status 1."""
+    """Run the command; a user's mistake ends it with one line and exit status 1.
+
+    A file that the system refuses to open, name or write is such a mistake too.
+    """
     choose_waiting()
     try:
         app()
     except InputError as error:
         sys.exit(f"error: {one_line(error)}")
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.exit(f"error: {InputError(f'{error.filename}: {error.strerror}')}")
 
 
 @app.callback()

@@ -121,8 +121,17 @@ def _with_few_fields(lens: Lens, overview: Overview) -> tuple[Lens, Overview]:
         return lens, overview
     outwards = points.norm(dim=-1).argsort(stable=True)
     places = torch.linspace(0, len(points) - 1, _MOST_FIELDS).round().long()
-    chosen = points[outwards[places].sort().values].tolist()
-    few = prepared_lens(lens, chosen)
+    chosen = outwards[places].sort().values.tolist()
+    few = prepared_lens(lens)
+    own = few.fields
+    assert own is not None  # the usual ones are fewer
+    few.fields = own._replace(
+        **{
+            name: None if values is None else tuple(values[n] for n in chosen)
+            for name, values in own._asdict().items()
+            if name != "kind"
+        }
+    )
     return few, lens_overview(few)
 
 

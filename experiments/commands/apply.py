@@ -30,6 +30,7 @@ from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.image_files import format_of
 
 logger = logging.getLogger(__name__)
 
@@ -199,15 +200,18 @@ def apply_run(
     """
     stems = [Path(file).stem for file in files]
     for file in files:
-        if not Path(file).expanduser().is_file():
-            raise InputError(f"{file}: no such file")
+        format_of(Path(file).expanduser())
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"{twice}: two pictures of this name would write the same files")
     run = load_run(folder, checkpoint, with_loss=False)
     camera = PictureCamera(run, options)
     into = run.folder / "applied" if out is None else Path(out).expanduser().resolve()
-    into.mkdir(parents=True, exist_ok=True)
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"--out: {into}: no folder can be made here ({reason})") from None
     found = []
     for file in files:
         each = camera.restore if options.raw else camera.apply
