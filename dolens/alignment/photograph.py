@@ -1,7 +1,6 @@
 """Photographs of point sources are read from image files."""
 
 import math
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
+from dolens.sensor.image_files import MEGAPIXELS, read_numbers
 from dolens.sensor.pixels import Sensor
 from dolens.typed_values import call_with_settings, check_type
 
@@ -56,6 +55,7 @@ def read_measurement(
     saturation: float | None = None,
     electrons_per_count: float = 1.0,
     read_noise: float = 1.0,
+    megapixels: float = MEGAPIXELS,
 ) -> Measurement:
     """Read a photograph of a source, 16 bits or 8, of one channel.
 
@@ -73,24 +73,15 @@ def read_measurement(
             integers can hold.
         electrons_per_count: of the sensor.
         read_noise: RMS of one pixel, electrons.
+        megapixels: the largest photograph that is read, millions of pixels.
 
     Raises:
         InputError: the file cannot be read, is not grey integers, or a number is out of range.
     """
     try:
-        with Image.open(path) as image:
-            values = np.asarray(image)
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        OverflowError,
-        struct.error,
-        Image.DecompressionBombError,
-    ) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"measurement: {path} cannot be read ({reason})") from error
+        values = read_numbers(Path(path).expanduser(), ("PNG", "TIFF"), megapixels)
+    except InputError as error:
+        raise InputError(f"measurement: {error.whole}") from error
     if values.ndim != 2 or values.dtype.kind not in "ui":
         raise InputError(
             f"measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
@@ -108,8 +99,7 @@ def read_measurement(
             f"measurement.electrons_per_count: {electrons_per_count}; allowed: above 0"
         )
     if saturation is None:
-        # Pillow gives 16 bits as int32.
-        saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0
+        saturation = float(np.iinfo(values.dtype).max)
     counts = torch.from_numpy(values.astype(np.float64))
     whole = Sensor(counts.shape[0], counts.shape[1], pixel_pitch)
     top, left, height, width = region or (0, 0, whole.height, whole.width)

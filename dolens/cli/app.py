@@ -35,7 +35,10 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command; a user's mistake ends it with one line and exit status 1."""
+    """Run the command; a user's mistake ends it with one line and exit status 1.
+
+    A file that the system refuses to open, name or write is such a mistake too.
+    """
     choose_waiting()
     for stream in (sys.stdout, sys.stderr):
         # Names of files may hold what no terminal shows.
@@ -45,6 +48,10 @@ def main() -> None:
         app()
     except InputError as error:
         sys.exit(f"error: {one_line(error)}")
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.exit(f"error: {InputError(f'{error.filename}: {error.strerror}')}")
 
 
 def _show_version(wanted: bool) -> None:

@@ -13,7 +13,9 @@ def apply(
     run: Annotated[str, typer.Argument(help="The folder of the run.", metavar="RUN")],
     pictures: Annotated[
         list[Path],
-        typer.Argument(help="PNG, TIFF or JPEG, 8 or 16 bits.", metavar="PICTURE..."),
+        typer.Argument(
+            help="PNG, TIFF, JPEG, BMP, GIF, PPM or WebP, 8 or 16 bits.", metavar="PICTURE..."
+        ),
     ],
     depth: Annotated[
         list[float] | None,
@@ -59,6 +61,10 @@ def apply(
         int,
         typer.Option(help="Pixels restored at once, along each side; the result is the same."),
     ] = 512,
+    megapixels: Annotated[
+        float,
+        typer.Option(help="The largest picture that is read, millions of pixels."),
+    ] = 64.0,
     checkpoint: Annotated[
         str, typer.Option(help="Whose weights: last, best, or the path of a file.")
     ] = "last",
@@ -87,6 +93,7 @@ def apply(
         raw=raw,
         black_level=black_level,
         white_level=white_level,
+        megapixels=megapixels,
     )
     folder, camera, found = module.apply_run(run, pictures, options, checkpoint, out, trust)
     where = "whole pictures" if camera.margin is None else f"windows of {window} pixels"

@@ -8,6 +8,7 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table as RichTable
 
     from dolens.lens_page.tables import Table
     from dolens.optics.lens import Lens
@@ -144,22 +145,43 @@ def _check_page(page: Path, lens: Path, force: bool) -> None:
 
 
 def _print_table(console: "Console", table: "Table") -> None:
+    """Print a table; one wider than the terminal goes on below, each part with its first column."""
+    from dolens.optics.tables import printable
+
+    def least(columns: list[int]) -> int:
+        wide = console.options.update(max_width=1000)
+        found = console.measure(_rich_table(table, columns), options=wide)
+        # Lists may go on in further lines; all else is printed as long as it is.
+        return found.minimum if table.listed & {*columns} else found.maximum
+
+    parts = [[0]]
+    for column in range(1, len(table.heads)):
+        if len(parts[-1]) > 1 and least([*parts[-1], column]) > console.width:
+            parts.append([0])
+        parts[-1].append(column)
+    for number, columns in enumerate(parts):
+        if number:
+            console.print()
+        # Where one column alone is too wide lines break: a cut number would look like another one.
+        width = max(console.width, least(columns))
+        console.print(_rich_table(table, columns), width=width, crop=False, no_wrap=True)
+    if table.caption:
+        console.print(printable(table.caption), style="dim", markup=False)
+
+
+def _rich_table(table: "Table", columns: list[int]) -> "RichTable":
+    """Return some columns of a table for the terminal."""
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
 
     from dolens.optics.tables import printable
 
-    shown = RichTable(
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        show_edge=False,
-        padding=(0, 1),
-    )
-    for column, head in enumerate(table.heads):
+    shown = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1))
+    for column in columns:
         words = column in table.words
         shown.add_column(
-            Text(head),
+            Text(table.heads[column]),
             justify="left" if words else "right",
             no_wrap=not words or (table.numbered and column not in table.listed),
             overflow="fold",
@@ -170,12 +192,8 @@ def _print_table(console: "Console", table: "Table") -> None:
         if total:
             shown.add_section()
         style = "bold" if total or number in table.lit else None
-        shown.add_row(*(Text(printable(cell)) for cell in row), style=style)
-    # Where the terminal is too narrow lines break: a cut number would look like another one.
-    least = console.measure(shown, options=console.options.update(max_width=1000)).minimum
-    console.print(shown, width=max(console.width, least), crop=False, no_wrap=True)
-    if table.caption:
-        console.print(printable(table.caption), style="dim", markup=False)
+        shown.add_row(*(Text(printable(row[column])) for column in columns), style=style)
+    return shown
 
 
 def _write(

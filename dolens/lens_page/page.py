@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+
 from dolens.errors import InputError
 from dolens.html import Child, Markup, joined
 from dolens.lens_page.content import Content, Section
@@ -26,6 +28,9 @@ from dolens.lens_page.tables import number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.export import laid_out, save_figures
+
+# Whose figures are drawn.
+_MOST_FIELDS = 9
 
 Progress = Callable[[str, int, int], None]
 
@@ -77,12 +82,15 @@ def write_page(
     Rarely needed:
         progress: is called with a title, the steps done and the number of all steps.
 
+    Tables list all fields; figures show nine of them at most, and the heading says which.
+
     Raises:
         InputError: a setting is out of range, or a file cannot be written.
     """
     lens = prepared_lens(lens, fields, wavelengths, f_number, entrance_pupil_diameter)
     overview = lens_overview(lens)
-    listed = PageSections(lens, overview, tolerances).sections()
+    shown, about = _with_few_fields(lens, overview)
+    listed = PageSections(shown, about, tolerances).sections()
     written = Written()
     blocks = _overview_blocks(overview, written)
     said = progress or (lambda title, done, total: None)
@@ -95,9 +103,37 @@ def write_page(
     tables, drawings = blocks[: len(overview.sections)], blocks[len(overview.sections) :]
     blocks = [*drawings[:first], *tables, *drawings[first:]]
     if path is not None:
-        _write(Path(path), page_html(overview.name, _facts(lens, overview), command, blocks))
+        facts = _facts(lens, overview)
+        if about is not overview:
+            labels = [field_label(p, about.conditions.field_unit) for p in about.conditions.fields]
+            facts.append(("fields of the figures", f"{len(labels)} of them: {', '.join(labels)}"))
+        _write(Path(path), page_html(overview.name, facts, command, blocks))
     written.sections = len(blocks)
     return written
+
+
+def _with_few_fields(lens: Lens, overview: Overview) -> tuple[Lens, Overview]:
+    """Return a lens and its overview with fields for figures: evenly many from the axis outwards.
+
+    A figure has a panel or a curve for each field, and takes as long as there are fields.
+    """
+    points = overview.conditions.fields
+    if len(points) <= _MOST_FIELDS:
+        return lens, overview
+    outwards = points.norm(dim=-1).argsort(stable=True)
+    places = torch.linspace(0, len(points) - 1, _MOST_FIELDS).round().long()
+    chosen = outwards[places].sort().values.tolist()
+    few = prepared_lens(lens)
+    own = few.fields
+    assert own is not None  # the usual ones are fewer
+    few.fields = own._replace(
+        **{
+            name: None if values is None else tuple(values[n] for n in chosen)
+            for name, values in own._asdict().items()
+            if name != "kind"
+        }
+    )
+    return few, lens_overview(few)
 
 
 def is_page(path: str | Path) -> bool:

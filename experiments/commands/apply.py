@@ -31,6 +31,7 @@ from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.image_files import format_of
 
 logger = logging.getLogger(__name__)
 
@@ -102,7 +103,7 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or is too small; or the depth lies in the lens.
         """
-        picture = read_picture(file)
+        picture = read_picture(file, self.options.megapixels)
         for note in picture.notes:
             logger.warning("%s: %s", file, note)
         _check_size(file, picture.linear.shape[-2:])
@@ -148,7 +149,7 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or has other channels than the run's sensor.
         """
-        array = read_array(file)
+        array = read_array(file, self.options.megapixels)
         _check_size(file, array.shape[:2])
         readout = self.camera.views.readout
         signal = signal_of(array, readout, file, self.options.black_level, self.options.white_level)
@@ -202,15 +203,18 @@ def apply_run(
     """
     stems = [Path(file).stem for file in files]
     for file in files:
-        if not Path(file).expanduser().is_file():
-            raise InputError(f"{file}: no such file")
+        format_of(Path(file).expanduser())
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"{twice}: two pictures of this name would write the same files")
     into = own_folder(folder, "applied") if out is None else Path(out).expanduser().resolve()
     run = load_run(folder, checkpoint, with_loss=False, trust=trust)
     camera = PictureCamera(run, options)
-    into.mkdir(parents=True, exist_ok=True)
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"--out: {into}: no folder can be made here ({reason})") from None
     found = []
     for file in files:
         each = camera.restore if options.raw else camera.apply

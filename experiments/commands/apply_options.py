@@ -1,5 +1,6 @@
 """How pictures are applied to: depths, scale, noise, and the files that are written."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,7 +9,10 @@ from dolens.experiments.camera.restored_windows import (
     DEFAULT_WINDOW,
     GRID,
 )
+from dolens.sensor.image_files import MEGAPIXELS
 
+# Pixels of a picture to one of the sensor.
+_LARGEST_SCALE = 1000.0
 _FORMATS = ("png", "tif")
 
 
@@ -28,6 +32,7 @@ class Options:
         raw: whether the files are what a real sensor gave.
         black_level: of raw files, in their own numbers; None: the run's readout's.
         white_level: likewise.
+        megapixels: the largest picture that is read, millions of pixels.
 
     Raises:
         InputError: a value that is not allowed.
@@ -44,6 +49,7 @@ class Options:
     raw: bool = False
     black_level: float | None = None
     white_level: float | None = None
+    megapixels: float = MEGAPIXELS
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
@@ -51,6 +57,16 @@ class Options:
         check_choice(self.format, _FORMATS, "--format")
         if self.window < GRID or self.window % GRID:
             raise InputError(f"--window: {self.window}; allowed: multiples of {GRID}, pixels")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"--seed: {self.seed}; allowed: 0 to 2^63 - 1")
+        if self.scale is not None and not 0.0 < self.scale <= _LARGEST_SCALE:
+            raise InputError(
+                f"--scale: {self.scale:g}; allowed: above 0, to {_LARGEST_SCALE:g} pixels"
+            )
+        if not all(0.0 < depth < math.inf for depth in self.depths):
+            raise InputError(f"--depth: {self.depths}; allowed: positive numbers, mm")
+        if not self.megapixels > 0.0:
+            raise InputError(f"--megapixels: {self.megapixels:g}; allowed: above 0")
         if not self.raw and (self.black_level, self.white_level) != (None, None):
             raise InputError("--black-level and --white-level are of raw files; give --raw too")
         if self.raw and (self.depths or self.scale or self.diffraction or self.save_raw):

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dolens.errors import InputError
-from dolens.experiments.data.photographs import DECODING_ERRORS, reason_of
+from dolens.sensor.image_files import MEGAPIXELS, read_numbers
 
 ENDINGS = (".npy", ".png", ".tif", ".tiff")
 """Endings of depth maps, in the order in which they are looked for."""
@@ -31,7 +30,7 @@ def is_depth_map(path: Path, suffix: str) -> bool:
     return path.stem.endswith(suffix) and path.suffix.lower() in ENDINGS
 
 
-def read_depth_map(path: Path, unit: float) -> Tensor:
+def read_depth_map(path: Path, unit: float, megapixels: float = MEGAPIXELS) -> Tensor:
     """Read a depth map in mm, (height, width), float32, with holes filled.
 
     Numbers that are zero, negative or not finite are holes, as depth cameras leave them in the
@@ -40,22 +39,13 @@ def read_depth_map(path: Path, unit: float) -> Tensor:
     Args:
         path: a grey image of integers or floating-point numbers, or an array that numpy saved.
         unit: mm per unit of its numbers.
+        megapixels: the largest that is read, millions of pixels.
 
     Raises:
         InputError: the file cannot be read, has several channels, or no depth at all.
     """
-    try:
-        if path.suffix.lower() == ".npy":
-            values = np.load(path, allow_pickle=False)
-        else:
-            with Image.open(path) as image:
-                values = np.asarray(image)
-    except DECODING_ERRORS as error:
-        raise InputError(
-            f"{path}: cannot be read as a depth map ({reason_of(error)}); "
-            f"allowed: {', '.join(ENDINGS)}"
-        ) from error
-    if values.ndim != 2 or values.dtype.kind not in "uif":
+    values = read_numbers(path, megapixels=megapixels)
+    if values.ndim != 2:
         raise InputError(
             f"{path}: {values.dtype} of shape {values.shape}; allowed: a depth map of one channel, "
             "integers or floating-point numbers"

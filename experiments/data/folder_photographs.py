@@ -63,6 +63,7 @@ class FolderPhotographs(Sequence[Photograph]):
         self._recorded = recorded
         self._cache: OrderedDict[int, Photograph] = OrderedDict()
         self._cached_bytes = 0
+        self._said: set[str] = set()
         self._seen = torch.zeros(len(paths), dtype=torch.uint8).share_memory_()
         self._changed = torch.zeros(len(paths), dtype=torch.bool).share_memory_()
 
@@ -140,6 +141,9 @@ class FolderPhotographs(Sequence[Photograph]):
             self._warn(error)
             return None
         self._seen[number] = _DECODED
+        for note in set(photograph.notes) - self._said:
+            self._said.add(note)
+            _log.warning("%s: %s (of other files alike this is not said again)", path, note)
         self._keep(number, photograph)
         return photograph
 

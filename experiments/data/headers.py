@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from dolens.experiments.data.folder_index import REFUSED, SOUND, FolderIndex
-from dolens.experiments.data.photographs import probe_photograph
+from dolens.sensor.pictures import probe_picture
 from dolens.stages import stage
 
 _log = logging.getLogger(__name__)
@@ -23,7 +23,10 @@ _SAID_EVERY = 15.0
 
 
 def with_headers(
-    index: FolderIndex, numbers: np.ndarray, keep: Callable[[FolderIndex], None]
+    index: FolderIndex,
+    numbers: np.ndarray,
+    keep: Callable[[FolderIndex], None],
+    megapixels: float,
 ) -> tuple[FolderIndex, dict[int, str]]:
     """Read the headers of files that no header is known of, and of those that were refused.
 
@@ -32,6 +35,7 @@ def with_headers(
         numbers: of those that count.
         keep: is given an index that has learnt something; when reading is interrupted too, so that
             the next start goes on from there.
+        megapixels: the largest photograph that is read, millions of pixels.
 
     Returns:
         The index with what was found, and why each refused file is refused.
@@ -51,7 +55,7 @@ def with_headers(
                 size[number], modified[number] = status.st_size, status.st_mtime_ns
             except OSError:
                 size[number] = modified[number] = -1
-            reason = probe_photograph(path)
+            reason = probe_picture(path, megapixels)
             header[number] = SOUND if reason is None else REFUSED
             if reason is not None:
                 refused[number] = reason

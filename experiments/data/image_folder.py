@@ -5,6 +5,7 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ from dolens.experiments.data.photographs import (
     normalised_extensions,
     read_photograph,
 )
+from dolens.sensor.image_files import MEGAPIXELS
 
 _log = logging.getLogger(__name__)
 
@@ -56,6 +58,8 @@ class ImageFolderDataModule(CropDataModule):
         index: keep the list of the files in the user's cache folder, for the next start.  It is
             checked against the times of the folders; small folders have none.
         cache_bytes: decoded pixels kept in memory, in each split and process.
+        megapixels: the largest photograph that is read, millions of pixels; a larger one counts as
+            unreadable, and is not decoded.
 
     Raises:
         InputError: an argument is out of range; at set-up, the folder is missing, empty, holds
@@ -73,6 +77,7 @@ class ImageFolderDataModule(CropDataModule):
         cache_bytes: int = 2**28,
         unreadable: Literal["error", "skip"] = "error",
         index: bool = True,
+        megapixels: float = MEGAPIXELS,
         **crops: Any,
     ) -> None:
         super().__init__(**crops)
@@ -101,6 +106,7 @@ class ImageFolderDataModule(CropDataModule):
         self.cache_bytes = cache_bytes
         self.unreadable = unreadable
         self.index = index
+        self.megapixels = megapixels
         self._paths: dict[Split, IndexedFiles] | None = None
         self._indices: list[tuple[IndexFile, FolderIndex]] = []
         self._refused: dict[Path, None] = {}
@@ -130,7 +136,8 @@ class ImageFolderDataModule(CropDataModule):
 
     def load_split(self, split: Split) -> FolderPhotographs:
         """Return the photographs of a split, none of them decoded yet."""
-        return self._photographs_of(split, read_photograph)
+        read = partial(read_photograph, megapixels=self.megapixels)
+        return self._photographs_of(split, read)
 
     def teardown(self, stage: str) -> None:
         """Report how many files could not be read; the index forgets files that have changed."""
@@ -199,7 +206,7 @@ class ImageFolderDataModule(CropDataModule):
         if not self.verify:
             self._indices.append((file, index))
             return IndexedFiles(index, numbers)
-        index, refused = with_headers(index, numbers, file.keep)
+        index, refused = with_headers(index, numbers, file.keep, self.megapixels)
         self._indices.append((file, index))
         for place, (number, reason) in enumerate(refused.items()):
             self._refused[index.path(number)] = None

@@ -1,6 +1,7 @@
 """Photographs with depth maps are read from any folder of both."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,9 @@ class RgbdFolderDataModule(ImageFolderDataModule):
 
     def load_split(self, split: Split) -> FolderPhotographs:
         """Return the photographs of a split with their depths, none of them decoded yet."""
-        read = partial(_read, suffix=self.depth_suffix, unit=self.depth_unit)
+        read = partial(
+            _read, suffix=self.depth_suffix, unit=self.depth_unit, megapixels=self.megapixels
+        )
         return self._photographs_of(split, read)
 
     def _wanted(self, index: FolderIndex) -> np.ndarray:
@@ -68,9 +71,11 @@ class RgbdFolderDataModule(ImageFolderDataModule):
         return np.array(photographs, dtype=np.int32)
 
 
-def _read(path: Path, suffix: str, unit: float) -> Photograph:
+def _read(path: Path, suffix: str, unit: float, megapixels: float) -> Photograph:
     """Read a photograph and its depth map."""
-    photograph, beside = read_photograph(path), depth_map_of(path, suffix)
+    photograph = read_photograph(path, megapixels=megapixels)
+    beside = depth_map_of(path, suffix)
     if beside is None:
         raise InputError(f"{path}: its depth map is no longer there")
-    return Photograph(photograph.name, photograph.encoded, read_depth_map(beside, unit))
+    depth = read_depth_map(beside, unit, megapixels)
+    return replace(photograph, depth=depth)

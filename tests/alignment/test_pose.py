@@ -255,9 +255,9 @@ def bomb():
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda p: p.write_bytes(b"none"), "cannot be read"),
-        (lambda p: p.write_bytes(b"P5 60000 60000 255\n"), "cannot be read .*3600000000 pixels"),
-        (lambda p: p.write_bytes(bomb()), r"cannot be read \(Image size \(10000000000 pixels\)"),
+        (lambda p: p.write_bytes(b"none"), "cannot be decoded"),
+        (lambda p: p.write_bytes(b"P5 60000 60000 255\n"), "raw values cannot be read from PPM"),
+        (lambda p: p.write_bytes(bomb()), "100000×100000 are 10000 million pixels"),
         (lambda p: Image.new("RGB", (4, 4)).save(p), "one channel of integers"),
     ],
 )

@@ -8,6 +8,8 @@ import torch
 
 from dolens import InputError, load_lens
 from dolens.lens_page import is_page, write_page
+from dolens.lens_page.overview import lens_overview
+from dolens.lens_page.page import _with_few_fields
 from dolens.lens_page.preparation import prepared_lens
 from tests.lens_page.conftest import HOSTILE
 
@@ -117,3 +119,14 @@ def test_a_lens_is_prepared_without_changing_it(root):
     assert shown.fields.points == ((0.0, 10.0),)
     pupil = shown.first_order(550).entrance_pupil.diameter
     assert math.isclose(float(pupil), 20.0, rel_tol=1e-9)
+
+
+def test_figures_of_many_fields_show_nine_from_the_axis_to_the_edge():
+    lens = prepared_lens(load_lens("cooke_triplet"), [(0.0, 0.2 * n) for n in range(100)])
+    overview = lens_overview(lens)
+    few, about = _with_few_fields(lens, overview)
+    assert len(overview.conditions.fields) == 100 and len(about.conditions.fields) == 9
+    angles = about.conditions.fields[:, 1].tolist()
+    assert angles[0] == 0.0 and angles[-1] == pytest.approx(19.8) and angles == sorted(angles)
+    assert len(few.fields.points) == 9
+    assert _with_few_fields(few, about) == (few, about)  # few enough

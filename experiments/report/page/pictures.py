@@ -6,6 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from dolens.sensor.image_files import opened_image
+
 # Twice what the page is wide, for sharp screens and for enlarging.
 _WIDEST = 1600
 _QUALITY = 90
@@ -18,9 +20,9 @@ def embedded(path: Path) -> str:
     smaller is taken: drawings are smaller without loss, photographs with it.
 
     Args:
-        path: any file that Pillow reads.
+        path: BMP, GIF, JPEG, PNG, PPM, TIFF or WebP.
     """
-    with Image.open(path) as image:
+    with opened_image(path) as image:
         picture = image.convert("RGB")
     if picture.width > _WIDEST:
         height = round(picture.height * _WIDEST / picture.width)
@@ -35,5 +37,5 @@ def embedded(path: Path) -> str:
 
 def size_of(path: Path) -> tuple[int, int]:
     """Return width and height of a picture in pixels."""
-    with Image.open(path) as image:
+    with opened_image(path) as image:
         return image.size

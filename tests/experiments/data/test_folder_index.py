@@ -85,7 +85,7 @@ def test_a_second_start_opens_no_file(settled, tmp_path, monkeypatch, caplog):
     (root / "broken.png").write_bytes(b"no image")
     first = split(data(root))
     opened = []
-    monkeypatch.setattr(headers, "probe_photograph", lambda path: opened.append(path) or "broken")
+    monkeypatch.setattr(headers, "probe_picture", lambda path, _: opened.append(path) or "broken")
     monkeypatch.setattr(os, "scandir", None)
     with caplog.at_level(logging.INFO):
         again = data(root)
@@ -100,9 +100,9 @@ def test_files_that_come_and_go_are_noticed(settled, tmp_path, monkeypatch, capl
     image(root / "n1" / "new.png")
     (root / NAMES[0]).unlink()
     image(root / "deep" / "er" / "new.png")
-    opened, probe = [], headers.probe_photograph
+    opened, probe = [], headers.probe_picture
     monkeypatch.setattr(
-        headers, "probe_photograph", lambda path: opened.append(path) or probe(path)
+        headers, "probe_picture", lambda path, _: opened.append(path) or probe(path, 64)
     )
     with caplog.at_level(logging.INFO):
         found = split(data(root))
@@ -176,20 +176,20 @@ def test_a_pipe_is_not_waited_for(settled, tmp_path, caplog):
     root = folder(tmp_path / "root")
     os.mkfifo(root / "pipe.png")
     assert data(root).paths and data(root).skipped_files == []
-    assert f"{root / 'pipe.png'}: not a readable image (OSError: not a file)" in caplog.text
+    assert f"{root / 'pipe.png'}: not a readable image (is no file" in caplog.text
 
 
 def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatch):
     root = folder(tmp_path / "root")
-    probe, opened = headers.probe_photograph, []
+    probe, opened = headers.probe_picture, []
 
-    def until_interrupted(path):
+    def until_interrupted(path, megapixels):
         opened.append(path)
         if len(opened) == 10:
             raise KeyboardInterrupt
-        return probe(path)
+        return probe(path, megapixels)
 
-    monkeypatch.setattr(headers, "probe_photograph", until_interrupted)
+    monkeypatch.setattr(headers, "probe_picture", until_interrupted)
     with pytest.raises(KeyboardInterrupt):
         split(data(root))
     split(data(root))
@@ -234,10 +234,10 @@ def test_an_image_bomb_is_one_line_and_no_memory(settled, tmp_path, caplog):
     (root / "bomb.png").write_bytes(bomb())
     module = data(root)
     assert module.paths and module.skipped_files == [root / "bomb.png"]
-    assert "bomb.png: not a readable image (DecompressionBombError" in caplog.text
+    assert "bomb.png: not a readable image (60000×60000 are 3600 million pixels" in caplog.text
     module = data(root, verify=False, validation_fraction=0.01, test_fraction=0.01)
     number = [path.name for path in module.paths["train"]].index("bomb.png")
-    with pytest.raises(InputError, match=r"bomb.png: cannot be decoded .*unreadable=skip"):
+    with pytest.raises(InputError, match=r"bomb.png: 60000×60000 are .*unreadable=skip"):
         module.photographs("train")[number]
 
 

@@ -9,9 +9,9 @@ from dolens.experiments.data.photographs import (
     EXTENSIONS,
     Photograph,
     normalised_extensions,
-    probe_photograph,
     read_photograph,
 )
+from dolens.sensor.pictures import probe_picture
 
 
 def _save(path, array, **options):
@@ -73,7 +73,7 @@ def test_cmyk(tmp_path):
 def test_broken_files_are_named(tmp_path, content):
     path = tmp_path / "broken.png"
     path.write_bytes(content)
-    assert probe_photograph(path)
+    assert probe_picture(path)
     with pytest.raises(InputError, match=r"broken\.png: cannot be decoded") as caught:
         read_photograph(path)
     assert "\n" not in str(caught.value)

@@ -94,7 +94,7 @@ def test_not_finite_is_a_hole(tmp_path):
     [
         (np.zeros((4, 4), np.uint16), "no depth above 0"),
         (np.ones((4, 4, 3), np.uint8), r"uint8 of shape \(4, 4, 3\)"),
-        (np.array(["a"], dtype=object), "cannot be read as a depth map"),
+        (np.array(["a"], dtype=object), "cannot be decoded"),
     ],
 )
 def test_a_map_that_is_none_is_an_error(tmp_path, values, message):
