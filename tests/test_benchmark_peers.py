@@ -2,10 +2,12 @@
 
 import csv
 import importlib
+import itertools
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from dolens import InputError
 
@@ -118,3 +120,37 @@ def test_a_program_that_fails_leaves_the_others_alone(scripts, checkout, tmp_pat
     for row in failed:
         assert row["note"] == "failed: RuntimeError: not on this machine"
     assert any(row["backend"] == "cpu" and row["failed"] == "False" for row in rows)
+
+
+def test_a_release_of_deeplens_says_its_version_under_its_name_of_pypi(scripts, checkout):
+    folder = checkout("deeplens")
+    (folder / "deeplens_core-2.5.6.dist-info").mkdir()
+    said = "Metadata-Version: 2.1\nName: deeplens-core\nVersion: 2.5.6\n"
+    (folder / "deeplens_core-2.5.6.dist-info" / "METADATA").write_text(said)
+    assert "DeepLens 2.5.6" in scripts("benchmarks.peer_paths").describe({"deeplens": folder})
+
+
+@pytest.mark.parametrize("lens", ["asphere", "cooke_triplet"])
+def test_points_of_any_program_are_compared_with_rays_of_28_digits(scripts, lens):
+    cases, golden = scripts("benchmarks.cases"), scripts("benchmarks.golden")
+    traced = cases.load(lens, torch.float64, "reference", torch.device("cpu"))
+
+    def error(shift):
+        return golden.golden_point_error(
+            lens, torch.float64, cases.WAVELENGTH, lambda rays: traced.trace(rays).position + shift
+        )
+
+    assert error(0.0) < 1e-12
+    assert error(torch.tensor([3e-4, 4e-4, 0.0])) == pytest.approx(5e-4, rel=1e-9)
+
+
+def test_runs_are_timed_by_the_clock_that_is_given(scripts):
+    timing = scripts("benchmarks.timing")
+    found = timing.by_turns(
+        [timing.Contender("a run", lambda: None, amount=2.0)],
+        0.0,
+        torch.device("cpu"),
+        clock=itertools.count().__next__,
+    )
+    # One tick from a run's beginning to its end, for two units.
+    assert found["a run"].seconds.tolist() == [0.5, 0.5, 0.5]

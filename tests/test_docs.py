@@ -4,6 +4,7 @@ import ast
 import importlib
 import re
 import shlex
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
@@ -149,3 +150,60 @@ def test_a_docstring_begins_with_a_sentence_and_not_with_a_title(path):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
             text = ast.get_docstring(node)
             assert text is None or not TITLES.match(text), text.splitlines()[0]
+
+
+def tables(document):
+    """The tables of a document: of each its rows, the header's names first."""
+    text = document.read_text(encoding="utf-8")
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        rows = [[cell.strip(" *") for cell in row.split("|")[1:-1]] for row in block.splitlines()]
+        yield rows[:1] + rows[2:]
+
+
+def number(cell):
+    """The first decimal number of a cell as it is printed; None where there is none."""
+    found = re.search(r"[+−-]?\d+\.\d+", cell)
+    return Decimal(found[0].replace("−", "-")) if found else None
+
+
+def printed_gains():
+    """Every gain in dB of the documents' tables: where it stands, it, and its two numbers."""
+    for row in next(rows for rows in tables(ROOT / "README.md") if "system" in rows[0][0]):
+        # In one cell: 26.75 dB by Adam, gain +0.37 dB; 26.86 dB by least squares, +0.48 dB.
+        for value, gain in re.findall(r"(\d+\.\d+) dB[^;]*?, (?:gain )?(\+\d+\.\d+) dB", row[3]):
+            yield f"README, {row[0]}", Decimal(gain), Decimal(value), number(row[1])
+    for document in DOCUMENTS:
+        for head, *rows in tables(document):
+            for place, row in enumerate(rows):
+                where = f"{document.name}, {row[0]}"
+                for column, cell in enumerate(row):
+                    # In one cell: 25.35: +1.38, over the first row.
+                    value, colon, gain = cell.partition(": ")
+                    if colon and re.fullmatch(r"\d+\.\d+", value):
+                        yield where, number(gain), number(value), number(rows[0][column])
+                    # In a row: over the two above.
+                    if row[0] == "gain" and column and cell:
+                        below, above = rows[place - 1][column], rows[place - 2][column]
+                        yield where, number(cell), number(below), number(above)
+                if "gain" not in head or not row[head.index("gain")]:
+                    continue
+                # In a column: over the row of the same conditions that has none.
+                gain = head.index("gain")
+                alike = [head.index(k) for k in ("seconds", "seeds", "tolerances") if k in head]
+                value = head.index("packages" if "packages" in head else "worst tenth")
+                (over,) = (r for r in rows if not r[gain] and all(r[i] == row[i] for i in alike))
+                yield where, number(row[gain]), number(row[value]), number(over[value])
+    # In a table of its own: a learned plate over the plain lens in bold.
+    text = (ROOT / "docs/results/phase_plate.md").read_text(encoding="utf-8")
+    row = r"\| (\d[^|]+\| \d+) \| {} \|(?:[^|]+\|){{4}} (\d+\.\d+) "
+    plate = dict(re.findall(row.format("learned plate"), text))
+    plain = dict(re.findall(row.format(r"\*\*plain[^|]+"), text))
+    for at, gain in re.findall(r"\| (\d[^|]+\| \d+) \| ([+-]\d+\.\d+) ", text):
+        yield f"phase_plate.md, {at}", *map(Decimal, (gain, plate[at], plain[at]))
+
+
+def test_a_gain_is_the_difference_of_its_two_printed_numbers():
+    gains = list(printed_gains())
+    assert len(gains) > 40
+    wrong = [(where, *map(str, rest)) for where, *rest in gains if rest[0] != rest[1] - rest[2]]
+    assert not wrong

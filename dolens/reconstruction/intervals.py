@@ -14,7 +14,7 @@ class Interval:
     """An `Interval` holds an estimate and its confidence interval, in the units of the scores.
 
     Attributes:
-        estimate: the statistic of the means over all seeds and photographs.
+        estimate: the mean over seeds of the statistic of means over photographs.
         low: lower end; NaN where there is one seed and one photograph.
         high: upper end; NaN likewise.
         seeds: how many seeds were resampled.
@@ -35,7 +35,10 @@ def bootstrap_interval(
     level: float = 0.95,
     resamples: int = 4000,
 ) -> Interval:
-    """Return the bootstrap interval of a statistic of mean scores.
+    """Return the bootstrap interval of a statistic of mean scores, averaged over seeds.
+
+    Each seed's camera has a statistic of its own, as the view that is worst for it, so that an
+    estimate is the mean of what is printed for each seed, and a gain the difference of two means.
 
     Seeds and photographs are crossed: each seed's camera is judged on each photograph.  Both are
     resampled, independently of each other and with replacement (Owen 2007, "The pigeonhole
@@ -55,7 +58,7 @@ def bootstrap_interval(
 
     Args:
         scores: (S, P, K): seed, photograph, and whatever the statistic takes, such as views.
-        statistic: maps mean scores (R, K) to (R,).
+        statistic: maps mean scores (R, K) to (R,), each row by itself.
         generator: draws the resamples; on the CPU.
 
     Rarely needed:
@@ -74,12 +77,13 @@ def bootstrap_interval(
         raise ValueError(f"resamples: {resamples}; allowed: 2 or more")
     scores = scores.detach().to("cpu", torch.float64)
     seeds, photographs, _ = scores.shape
-    estimate = float(statistic(scores.mean(dim=(0, 1))[None])[0])
+    estimate = float(statistic(scores.mean(dim=1)).mean())
     if seeds == photographs == 1 or not bool(scores.isfinite().all()):
         return Interval(estimate, math.nan, math.nan, seeds, photographs)
     of_seeds = _weights(seeds, resamples, generator)
     of_photographs = _weights(photographs, resamples, generator)
-    found = statistic(torch.einsum("rs,spk,rp->rk", of_seeds, scores, of_photographs))
+    means = torch.einsum("rp,spk->rsk", of_photographs, scores)
+    found = (of_seeds * statistic(means.flatten(0, 1)).view(resamples, seeds)).sum(dim=1)
     degrees = _degrees_of_freedom(scores, statistic)
     quantile = float(stdtrit(degrees, 0.5 * (1.0 + level)))
     tails = torch.tensor([ndtr(-quantile), ndtr(quantile)], dtype=found.dtype)
@@ -97,7 +101,8 @@ def gain_interval(
     level: float = 0.95,
     resamples: int = 4000,
 ) -> Interval:
-    """Return the paired interval of a gain, statistic(mean scores) - statistic(mean against).
+    """Return the paired interval of a gain, the mean over seeds of statistic(mean scores) -
+    statistic(mean against).
 
     Args:
         scores: (S, P, K), see `bootstrap_interval`.
@@ -142,14 +147,16 @@ def _degrees_of_freedom(scores: Tensor, statistic: Callable[[Tensor], Tensor]) -
     """Return Welch and Satterthwaite's ν = (Σ V)² / Σ (V² / (n - 1)), V by jackknife over each
     axis.
     """
+    seeds, photographs, _ = scores.shape
+    of_seeds = statistic(scores.mean(dim=1))
+    without = (scores.sum(dim=1, keepdim=True) - scores) / max(photographs - 1, 1)
+    of_photographs = statistic(without.flatten(0, 1)).view(seeds, photographs).mean(dim=0)
     variances, weighted = 0.0, 0.0
-    for axis in (0, 1):
-        count = scores.shape[axis]
+    for values, factor in ((of_seeds, 1 / max(seeds - 1, 1)), (of_photographs, photographs - 1)):
+        count = len(values)
         if count == 1:
             continue
-        means = scores.mean(dim=1 - axis)
-        without = (means.sum(dim=0) - means) / (count - 1)
-        variance = float(statistic(without).var(correction=0)) * (count - 1)
+        variance = float(values.var(correction=0)) * factor
         variances += variance
         weighted += variance**2 / (count - 1)
     return variances**2 / weighted if weighted > 0.0 else math.inf

@@ -1,9 +1,11 @@
 """Errors against tests/reference: rays traced in 28 digits."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from dolens import Rays, Status
 from dolens.prescriptions import lens_from_prescription, load_prescription
@@ -13,6 +15,7 @@ FOLDER = ROOT / "tests" / "reference" / "rays"
 STATUS = {"ok": Status.OK, "vignetted": Status.VIGNETTED, "tir": Status.TIR, "miss": Status.MISSED}
 # The lens's file and its reference's.
 FILES = {
+    "asphere": "rays_asphere_initial__dfc.json",
     "cooke_triplet": "rays_triplet__dfc.json",
     "wavefront_coding": "rays_wfc_cubic_1e-4__dfc.json",
     "large_fov_doublet": "rays_largefov__dfc.json",
@@ -29,7 +32,7 @@ def golden_error(
     """
     if name not in FILES:
         return float("nan"), 0
-    data = json.loads((FOLDER / FILES[name]).read_text(encoding="utf-8"))
+    data = _reference(name)
     rays = data["rays"]
     lens = lens_from_prescription(
         load_prescription(ROOT / "conf" / "lens" / f"{name}.yaml"), dtype, data["index_model"]
@@ -47,6 +50,32 @@ def golden_error(
     status = torch.tensor([int(STATUS[ray["status"]]) for ray in rays])
     error = (hit.position.cpu().double() - sensor).norm(dim=-1)[valid].max()
     return float(error), int((hit.status.cpu() != status).sum())
+
+
+def golden_point_error(
+    name: str, dtype: torch.dtype, wavelength: float, sensor_points: Callable[[Rays], Tensor]
+) -> float:
+    """Largest distance, mm, of any program's points on the sensor from those of the reference's
+    valid rays of one wavelength (nm).
+
+    NaN for a lens that has no reference rays.
+    """
+    if name not in FILES:
+        return float("nan")
+    rays = [
+        ray
+        for ray in _reference(name)["rays"]
+        if ray["valid"] and float(ray["wavelength"]) == wavelength
+    ]
+    position, direction, sensor = (
+        _numbers(ray[key] for ray in rays) for key in ("o", "d", "sensor")
+    )
+    found = sensor_points(Rays(position.to(dtype), direction.to(dtype), wavelength))
+    return float((found.detach()[:, :2].double() - sensor[:, :2]).norm(dim=-1).max())
+
+
+def _reference(name: str) -> dict:
+    return json.loads((FOLDER / FILES[name]).read_text(encoding="utf-8"))
 
 
 def _numbers(rows) -> torch.Tensor:  # noqa: ANN001 - of nested decimal strings

@@ -69,7 +69,8 @@ def _version(peer: type[Peer], folder: Path) -> str:
         words = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
         return run(words, capture_output=True, text=True, check=False).stdout.strip()
     for found in distributions(path=[str(folder)]):
-        if found.name == peer.module:
+        # DeepLens is `deeplens-core` on PyPI.
+        if found.name.removesuffix("-core") == peer.module:
             return found.version
     # What a checkout without its history says of itself.
     for file in (folder / "pyproject.toml", folder / peer.module / "version.py"):

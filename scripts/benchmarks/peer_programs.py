@@ -112,30 +112,27 @@ class DeepLens(Peer):
     name, module, word = "DeepLens", "deeplens", "deeplens"
 
     def __init__(self, lens: Lens) -> None:
-        from deeplens.optics import geometric_surface as shapes
-        from deeplens.optics.materials import Material
-        from deeplens.optics.ray import Ray
+        from deeplens import geometric_surface as shapes
+        from deeplens.light.ray import Ray
 
         self._ray = Ray
-        *places, self._sensor = (float(z.detach()) for z in lens.system().vertices)
-        self._indices = [float(index) for index in lens.system().indices(WAVELENGTH)]
+        system = lens.system()
+        self._indices = [float(index) for index in system.indices(WAVELENGTH)]
+        gaps = [float(gap.detach()) for gap in (*system.thicknesses, system.sensor_distance)]
         self._surfaces, self._curved = [], {}
-        for (number, surface), z in zip(lens.surfaces.items(), places, strict=True):
+        for (number, surface), gap in zip(lens.surfaces.items(), gaps, strict=True):
             p = {name: float(value.detach()) for name, value in surface.named_parameters()}
             rim, c = surface.semi_diameter, p.get("curvature", 0.0)
             if surface.kind == "aperture":
-                made = shapes.Aperture(rim, z)
+                made = shapes.Aperture(rim, gap)
             elif surface.kind in _FLAT or c == 0.0:
-                made = shapes.Plane(rim, z, "air")
+                made = shapes.Plane(rim, gap, "air")
             elif surface.kind == "sphere":
-                made = shapes.Spheric(c, rim, z, "air")
+                made = shapes.Spheric(c, rim, gap, "air")
             elif surface.kind in ("conic", "even_asphere"):
-                # Its coefficients begin at r².
-                coefficients = [0.0, *_even_powers(p)]
-                made = shapes.Aspheric(rim, z, c, p["conic"], coefficients, "air")
+                made = shapes.Aspheric(rim, gap, c, p["conic"], _even_powers(p), "air")
             else:
                 raise InputError(f"no model of type '{surface.kind}'")
-            made.mat2 = Material("air")
             self._surfaces.append(made)
             if c != 0.0:
                 self._curved[number] = made
@@ -150,7 +147,9 @@ class DeepLens(Peer):
             self._surfaces, self._indices[:-1], self._indices[1:], strict=True
         ):
             ray = surface.ray_reaction(ray, before, behind)
-        return ray.prop_to(self._sensor).o[:, :2], leaves
+            # Each surface has its vertex at z = 0, and so has the sensor behind them.
+            ray.o[..., 2] -= surface.d_next
+        return ray.prop_to(0.0).o[:, :2], leaves
 
 
 class Optiland(Peer):

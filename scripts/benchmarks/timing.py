@@ -56,13 +56,15 @@ def quartiles(values: np.ndarray) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
-def timed(run: Callable[[], Any], device: torch.device) -> float:
-    """Seconds of one run, until the device has finished."""
+def timed(
+    run: Callable[[], Any], device: torch.device, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Seconds of one run by a clock, until the device has finished."""
     _finish(device)
-    start = time.perf_counter()
+    start = clock()
     result = run()
     _finish(device)
-    seconds = time.perf_counter() - start
+    seconds = clock() - start
     del result
     return seconds
 
@@ -73,6 +75,7 @@ def by_turns(
     device: torch.device,
     least: int = 3,
     most: int = 51,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, Timing]:
     """Time contenders one after the other, again and again.
 
@@ -82,6 +85,8 @@ def by_turns(
         device: where they run.
         least: rounds in any case.
         most: rounds at most.
+        clock: of a run's seconds; `time.process_time` does not count the time of other programs,
+            and adds up that of all threads.
 
     Returns:
         By name.  A contender that raises is out, and its message kept.
@@ -92,8 +97,8 @@ def by_turns(
     for contender in contenders:
         try:
             # The first may compile; a run that is slow even so needs no second.
-            first = timed(contender.run, device)
-            again = timed(contender.run, device) if first < SLOW else first
+            first = timed(contender.run, device, clock)
+            again = timed(contender.run, device, clock) if first < SLOW else first
             settle[contender.name] = again < SETTLE
         except Exception as error:  # of any program: the table says what happened
             failures[contender.name] = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -105,7 +110,7 @@ def by_turns(
         for contender in left:
             if settle[contender.name]:
                 timed(contender.run, device)
-            seconds[contender.name].append(timed(contender.run, device) / contender.amount)
+            seconds[contender.name].append(timed(contender.run, device, clock) / contender.amount)
     return {
         name: Timing(np.asarray(values), failures.get(name, "")) for name, values in seconds.items()
     }

@@ -110,7 +110,7 @@ def _worst(means: Tensor) -> Tensor:
 
 def _worst_of(by_seed: dict[int, Result], judge: str) -> float:
     scores = torch.stack([r.scores[judge] for r in by_seed.values()])
-    return float(scores.mean((0, 1)).min())
+    return float(_worst(scores.mean(1)).mean())
 
 
 def _gain(by_seed: dict[int, Result], against: dict[int, Result], judge: str) -> Interval:

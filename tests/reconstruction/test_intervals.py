@@ -98,6 +98,25 @@ def test_the_worst_view_is_the_worst_of_the_means():
     assert bootstrap_interval(scores, worst, seeded()).estimate == 1.0
 
 
+def test_a_gain_is_the_difference_of_the_means_that_are_printed_for_the_seeds():
+    # One seed is worst in the first view, the other in the second: each is printed with its own.
+    scores = torch.tensor([[[24.0, 26.0]], [[27.0, 25.0]]]).expand(-1, 4, -1)
+    against = torch.tensor([[[23.0, 24.0]], [[23.5, 24.0]]]).expand(-1, 4, -1)
+    printed = [float(worst(side.mean(dim=1)).mean()) for side in (scores, against)]
+    assert printed == [24.5, 23.25]
+    assert gain_interval(scores, against, worst, seeded()).estimate == printed[0] - printed[1]
+
+
+@pytest.mark.parametrize("photographs", [1, 3])
+def test_two_seeds_with_worst_views_of_their_own_have_students_interval(photographs):
+    # Their worst means are 24 and 25, whatever the photographs, which are all alike.
+    scores = torch.tensor([[[24.0, 26.0]], [[27.0, 25.0]]]).expand(-1, photographs, -1)
+    found = bootstrap_interval(scores, worst, seeded(), resamples=20000)
+    half = student_t.ppf(0.975, 1) * 0.5
+    assert found.low == pytest.approx(24.5 - half, rel=0.02)
+    assert found.high == pytest.approx(24.5 + half, rel=0.02)
+
+
 def test_the_same_generator_gives_the_same_interval():
     scores = torch.randn(3, 12, 2, generator=seeded(5))
     found = bootstrap_interval(scores, worst, seeded(6))
