@@ -57,17 +57,19 @@ def printed_commands():
         if block.language == "sh" and block.page not in TUTORIALS:
             found += commands_of(block)
     for document in DOCUMENTS:
+        if str(document.relative_to(ROOT)) in TUTORIALS:
+            continue
         for text in INLINE.findall(document.read_text(encoding="utf-8")):
             words = ["dolens", "train"] * text.startswith("exp") + shlex.split(text)
             # `dolens apply` is the name of a command; `dolens report` is a whole one.
             if not PLACEHOLDER.search(text) and (len(words) > 2 or words[-1] in ALONE):
                 found.append(words)
-    return list(dict.fromkeys(tuple(words) for words in found if "my_camera" not in words[-1]))
+    return list(dict.fromkeys(tuple(words) for words in found))
 
 
 def kind_of(words):
     """What a command starts."""
-    if words[:2] == ("dolens", "train") or "train.py" in words or ".venv/bin/python" in words:
+    if words[:2] == ("dolens", "train") or "train.py" in words:
         return "train"
     if "dolens" in words:
         return words[words.index("dolens") + 1]
@@ -98,10 +100,17 @@ def here(tmp_path_factory):
     for name in ("conf/lens", "conf/experiment", "lenses", "Zemax/Glasscat"):
         (folder / name).mkdir(parents=True)
     triplet = load_lens("cooke_triplet")
-    for name in ("lens.zmx", "lens.seq", "lenses/one.zmx", "lens.txt", "conf/lens/mylens.yaml"):
+    for name in (
+        "lens.zmx",
+        "lens.seq",
+        "lens.json",
+        "lenses/one.zmx",
+        "lens.txt",
+        "conf/lens/mylens.yaml",
+    ):
         save_lens(triplet, folder / name)
     for block in BLOCKS:
-        if block.title and block.page == "docs/cameras.md":
+        if block.title and block.page not in TUTORIALS:
             (folder / block.title.partition("/")[2]).write_text(block.text, encoding="utf-8")
     return folder
 
