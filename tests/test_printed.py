@@ -37,6 +37,7 @@ PLACEHOLDER = re.compile(r"\.\.\.|…|\b(?:NAME|LENS|FOLDER|A B)\b(?!/)|\[key=")
 ALONE = ("experiments", "report")
 OTHERS = (
     ".venv/bin/pip",
+    ".venv/bin/python",
     "python3",
     "pip",
     "apt",
