@@ -9,21 +9,19 @@ from dolens.errors import InputError
 def packaged_configuration() -> Path:
     """Return the folder of the configuration that comes with dolens.
 
-    It is `dolens/conf` where dolens was installed from a wheel, and `conf` beside the package in a
-    checkout of the repository.  Its subfolders are the groups: `lens`, `experiment`, `network`, …
+    It is `dolens/conf`, which in a checkout of the repository is a link to `conf`.  Its subfolders
+    are the groups: `lens`, `experiment`, `network`, …
 
     Raises:
-        InputError: neither folder is there: the installation is not complete.
+        InputError: the folder is not there: the installation is not complete.
     """
-    package = Path(__file__).resolve().parent
-    candidates = (package / "conf", package.parent / "conf")
-    for folder in candidates:
-        if (folder / "train.yaml").is_file():
-            return folder
-    raise InputError(
-        "the configuration of dolens is missing: there is no train.yaml in "
-        f"{' or '.join(map(str, candidates))}; install dolens again"
-    )
+    folder = (Path(__file__).resolve().parent / "conf").resolve()
+    if not (folder / "train.yaml").is_file():
+        raise InputError(
+            f"the configuration of dolens is missing: no train.yaml in {folder}; "
+            "install dolens again"
+        )
+    return folder
 
 
 def installed_version(package: str) -> str | None:

@@ -1,8 +1,8 @@
 """Measure the gain of wavefront coding over the best plain lens, against light and depth range.
 
     python scripts/coding_gain.py bound                # by linear filters: seconds, no training
-    python scripts/coding_gain.py train --folder runs  # trains coded and plain cameras: hours
-    python scripts/coding_gain.py show runs/*/* --figure coding_gain.png
+    python scripts/coding_gain.py train                # trains coded and plain cameras: hours
+    python scripts/coding_gain.py show outputs/coding_gain/*/* --figure coding_gain.png
 
 The plain lens is the same one without its plate, refocused, and stopped down as far as is best on
 validation at equal exposure time; the coded one has learned plate and focus at full aperture.
@@ -137,7 +137,7 @@ def main(arguments: Sequence[str]) -> int:
     show.add_argument("folders", nargs="+", type=Path)
     show.add_argument("--judge", default="wave", help="whose scores count; '' for rays")
     training = commands.add_parser("train", help="train coded and plain cameras")
-    training.add_argument("--folder", type=Path, required=True)
+    training.add_argument("--folder", type=Path, default=Path("outputs/coding_gain"))
     training.add_argument("--seeds", type=int, default=1)
     training.add_argument("overrides", nargs="*", help="of train.py, as data=package_photographs")
     for part in (bound, show, training):

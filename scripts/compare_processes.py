@@ -181,7 +181,7 @@ def row_of(name: str, case: Case, one: Run, two: Run) -> tuple[str, bool]:
 def main(arguments: Sequence[str]) -> int:
     """Train and compare; print a row for each case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("cases", nargs="*", choices=list(CASES), help="none: all")
+    parser.add_argument("cases", nargs="*", choices=[*CASES, "all"], default="all")
     parser.add_argument("--folder", type=Path, help="for the runs; default: a temporary one")
     given = parser.parse_args(arguments)
     held = True
@@ -190,7 +190,7 @@ def main(arguments: Sequence[str]) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         print("| case | network | over its way | lens over its way | loss | steps |", flush=True)
         print("|---|---|---|---|---|---|", flush=True)
-        for name in given.cases or CASES:
+        for name in CASES if "all" in given.cases else given.cases:
             try:
                 one, two = (trained(CASES[name], n, folder / f"{name}_{n}") for n in (1, 2))
             except subprocess.CalledProcessError as error:

@@ -173,7 +173,7 @@ def course_of(kind: str, steps: int, folder: Path) -> Course:
 def main(arguments: Sequence[str]) -> int:
     """Run the kinds, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="*", choices=list(KINDS), help="none: all")
+    parser.add_argument("kinds", nargs="*", choices=[*KINDS, "all"], default="all")
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--folder", type=Path, help="for the runs; else a temporary one")
     given = parser.parse_args(arguments)
@@ -184,7 +184,7 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        for kind in given.kinds or KINDS:
+        for kind in KINDS if "all" in given.kinds else given.kinds:
             found = course_of(kind, given.steps, folder.resolve())
             print("\n".join(found.lines()), flush=True)
             flat = flat and found.is_flat()

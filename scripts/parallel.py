@@ -175,14 +175,14 @@ def lines_of(seconds: Mapping[str, list[float]], results: Mapping[str, set[str]]
 def main(arguments: Sequence[str]) -> int:
     """Measure, and print a table for each kind."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="*", choices=list(KINDS), help="none: all")
+    parser.add_argument("kinds", nargs="*", choices=[*KINDS, "all"], default="all")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--tiny", action="store_true", help="sizes that tell nothing")
     parser.add_argument("--folder", type=Path, help="for the runs; default: a temporary one")
     given = parser.parse_args(arguments)
     differ = False
     with tempfile.TemporaryDirectory() as temporary:
-        for kind in given.kinds or KINDS:
+        for kind in KINDS if "all" in given.kinds else given.kinds:
             folder, measured = (given.folder or Path(temporary)) / kind, KINDS[kind](given.tiny)
             seconds: dict[str, list[float]] = defaultdict(list)
             results: dict[str, set[str]] = defaultdict(set)

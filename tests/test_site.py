@@ -42,6 +42,13 @@ def test_no_page_loads_anything_from_the_network(site):
         assert not loaded, (page.name, loaded)
 
 
+def test_the_search_needs_no_server(site):
+    """Its index is a script, and its worker a frame: a page from a folder may load no more."""
+    assert (site / "search/search_index.js").read_text("utf-8").startswith("var __index")
+    assert (site / "search_frame.js").is_file()
+    assert 'src="search_frame.js"' in (site / "index.html").read_text("utf-8")
+
+
 def test_the_api_has_what_a_user_imports(site):
     text = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
     for name in ("load_lens", "DampedLeastSquares", "RayRenderer", "UNetRestoration", "Experiment"):

@@ -137,7 +137,8 @@ def _show(console: "Console", exported: "Exported") -> None:
         if not name.startswith("drawing/"):
             sizes = f"; {facts['sizes']}" if "sizes" in facts else ""
             table.add_row(name, facts["is"] + sizes, facts.get("error", ""))
-    console.print(table)
+    if table.row_count:
+        console.print(table)
     for sentence in exported.notes:
         console.print(sentence, style="yellow", markup=False)
     for name, reason in exported.refused.items():

@@ -153,6 +153,8 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
     chosen = next((each for each in FORMATS if suffix in each.suffixes), None)
     if chosen is None or chosen.write is None:
         why = f"{chosen.name} is read, not written" if chosen else "unknown suffix"
+        if suffix in (".step", ".stp"):
+            why = "solids are written by 'dolens export LENS --only step'"
         raise InputError(f"{path}: {why}; lens files are written as {', '.join(WRITTEN_SUFFIXES)}")
     try:
         return chosen.write(prescription, str(path))

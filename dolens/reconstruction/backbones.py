@@ -137,7 +137,9 @@ def load_backbone(
 
     Args:
         name: "mobilenet_v2" or "googlenet".
-        in_channels, stages, width_multiplier: see `Backbone`.
+        in_channels: see `Backbone`.
+        stages: see `Backbone`.
+        width_multiplier: see `Backbone`.
         weights: "imagenet" requires trained weights, from a file or the torch cache; "auto" starts
             at random, with a warning, where there are none; "download" requires them, and downloads
             them where there are none; "none" starts at random.  Only "download" uses the network.

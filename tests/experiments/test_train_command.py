@@ -84,8 +84,9 @@ def installed(root, tmp_path_factory) -> Path:
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("installed")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(root / name, source)
-    for name in ("dolens", "experiments", "conf", "hydra_plugins"):
-        shutil.copytree(root / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("src", "dolens", "experiments", "conf", "hydra_plugins"):
+        ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+        shutil.copytree(root / name, source / name, symlinks=True, ignore=ignored)
     build = "import setuptools.build_meta as b, sys; b.build_wheel(sys.argv[1])"
     subprocess.run(
         [sys.executable, "-c", build, str(target)], cwd=source, check=True, capture_output=True
@@ -249,24 +250,29 @@ def test_a_shell_completes_options_and_settings(own, before, incomplete, expecte
     assert all(text.startswith(incomplete) for text in found)
 
 
-def test_a_checkout_that_is_not_installed_says_how_to_install_it(root, tmp_path):
-    """Python finds dolens beside train.py, but its experiments only where it is installed."""
-    shutil.copy(root / "train.py", tmp_path)
-    (tmp_path / "dolens/experiments").mkdir(parents=True)
-    for name in ("dolens", "dolens/experiments", "dolens/cli"):
-        (tmp_path / name).mkdir(exist_ok=True)
-        (tmp_path / name / "__init__.py").touch()
-    (tmp_path / "dolens/cli/train.py").write_text("run_training = None")
+def test_a_checkout_that_is_not_installed_says_how_to_install_it(root):
     done = subprocess.run(
-        [sys.executable, str(tmp_path / "train.py")], capture_output=True, text=True
+        [sys.executable, "-S", "train.py"], cwd=root, capture_output=True, text=True
     )
-    assert done.returncode == 1
-    assert "another checkout" in done.stderr and 'pip install -c constraints.txt -e ".[train]"' in (
-        done.stderr
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert "is not installed for this Python" in done.stderr
+    assert 'pip install -c constraints.txt -e ".[train]"' in done.stderr
+
+
+def test_a_folder_called_dolens_beside_a_script_hides_nothing(tmp_path):
+    """It has no `__init__.py`: a clone in the user's home, or results.  Nor is anything of the
+    user's hidden by a folder of the checkout.
+    """
+    for name in ("dolens/experiments", "hydra_plugins", "experiments", "conf"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "experiments/mine.py").touch()
+    (tmp_path / "script.py").write_text(
+        "import dolens, dolens.conf, dolens.experiments, hydra_plugins.dolens_launchers\n"
+        "import conf, experiments.mine\n"
+        "dolens.load_lens('cooke_triplet')\n"
+        "print(*conf.__path__, *experiments.__path__)"
     )
-    shutil.rmtree(tmp_path / "dolens/experiments")
     done = subprocess.run(
-        [sys.executable, "-S", str(tmp_path / "train.py")], capture_output=True, text=True
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
     )
-    assert done.stderr.startswith("error: dolens.experiments is not installed for this Python")
-    assert done.stderr.count("\n") == 1
+    assert done.stdout.split() == [str(tmp_path / "conf"), str(tmp_path / "experiments")], done

@@ -190,6 +190,8 @@ def test_the_command_goes_on_without_a_format_unless_it_was_asked_for(root, tmp_
     asked = CliRunner().invoke(app, ["export", lens, "--out", str(tmp_path), "--only", "yaml,zmx"])
     assert asked.exit_code == 1 and (tmp_path / "lens.yaml").is_file()
     assert "cannot hold type 'b_spline'" in " ".join(asked.output.split())
+    none = CliRunner().invoke(app, ["export", lens, "--out", str(tmp_path), "--only", "zmx"])
+    assert none.exit_code == 1 and none.output.startswith("not written:")  # and no empty table
     alone = CliRunner().invoke(app, ["export", lens, "--out", str(tmp_path), "--only", "yaml"])
     assert alone.exit_code == 0, alone.output
     wrong = CliRunner().invoke(app, ["export", lens, "--only", "onnx"])

@@ -133,7 +133,15 @@ def test_figures_of_a_near_object_name_lens_aperture_and_wavelength(singlet, met
     assert singlet.surfaces["1"].semi_diameter == 2.0
 
 
+@pytest.mark.parametrize("method", ["summary", *METHODS])
+def test_an_argument_that_a_method_does_not_have_is_named_with_the_method(singlet, method):
+    with pytest.raises(InputError, match=rf"^{method}\(\): unknown key 'num_rays'.*f_number"):
+        getattr(singlet, method)(num_rays=5)
+
+
 def test_wrong_options_are_named(singlet):
+    with pytest.raises(InputError, match="did you mean 'rays'"):
+        singlet.draw(num_rays=5)
     with pytest.raises(InputError, match="f_number"):
         singlet.spots(f_numbre=4.0)
     with pytest.raises(InputError, match="object_distance"):

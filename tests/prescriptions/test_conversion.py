@@ -139,6 +139,7 @@ def test_the_command_writes_whole_files_and_overwrites_none_unasked(tmp_path):
         ((old, new), f"{new}: exists already; --force overwrites it"),
         ((new, new), f"{new}: is A itself; --force overwrites it"),
         ((old, tmp_path / "b.pdf"), "unknown suffix; lens files are written as .yaml, .yml, .zmx"),
+        ((old, tmp_path / "b.stp"), "solids are written by 'dolens export LENS --only step'"),
         ((old, tmp_path / "none" / "b.txt"), "cannot be written (No such file or directory)"),
         ((tmp_path / "none.zmx", new), "cannot be read (No such file or directory)"),
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -22,19 +23,32 @@ def as_lens(views: Any) -> Lens:
 
 
 def looked_at(
-    lens: Any,
+    view: Any,
     fields: FieldPoints | None,
     wavelengths: Wavelengths,
     object_distance: float | None,
     aperture: dict[str, float],
 ) -> tuple[Lens, Conditions]:
-    """Return the lens at an aperture, and the conditions that it is looked at."""
+    """Return the lens of a view at an aperture, and the conditions that it is looked at.
+
+    Args:
+        view: the method of the lens that was called.
+        fields: see `LensViews`, as the next two.
+        wavelengths: nm.
+        object_distance: mm.
+        aperture: the other keyword arguments of the call.
+
+    Raises:
+        InputError: the method has no such argument.
+    """
     from dolens.analysis.conditions import conditions
     from dolens.errors import check_keys
     from dolens.optics.aperture_setting import with_aperture
 
-    check_keys(aperture, ("f_number", "entrance_pupil_diameter"), "aperture")
-    lens = with_aperture(lens, **aperture)
+    settings = ("f_number", "entrance_pupil_diameter")
+    named = [name for name in signature(view).parameters if name != "aperture"]
+    check_keys(aperture, (*named, *settings), f"{view.__name__}()")
+    lens = with_aperture(view.__self__, **aperture)
     return lens, conditions(lens, fields, wavelengths, object_distance)
 
 

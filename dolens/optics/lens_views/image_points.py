@@ -51,7 +51,7 @@ class ImagePointViews:
         from dolens.analysis.spot_diagram import spot_diagram
         from dolens.plotting.spots import spots_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.spots, fields, wavelengths, object_distance, aperture)
         spots = spot_diagram(lens, given.fields, given.wavelengths, rays, given.object_distance)
         return shown(spots_figure(spots, overlaid, title_of("Spot diagram", lens, given)))
 
@@ -66,7 +66,7 @@ class ImagePointViews:
         from dolens.analysis.ray_fans import ray_fans
         from dolens.plotting.ray_fans import ray_fans_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.ray_fans, fields, wavelengths, object_distance, aperture)
         fans = ray_fans(
             lens, given.fields, given.wavelengths, object_distance=given.object_distance
         )
@@ -105,7 +105,7 @@ class ImagePointViews:
         from dolens.diffraction.transfer import diffraction_modulation
         from dolens.plotting.modulation_comparison import modulation_comparison_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.mtf, fields, wavelengths, object_distance, aperture)
         scene = given.fields, given.wavelengths
         distance = given.object_distance
         if frequencies is None:
@@ -140,7 +140,9 @@ class ImagePointViews:
         from dolens.diffraction.point_spread import diffraction_encircled_energy
         from dolens.plotting.encircled_energy import encircled_energy_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(
+            self.encircled_energy, fields, wavelengths, object_distance, aperture
+        )
         scene, distance = (given.fields, given.wavelengths), given.object_distance
         waves = diffraction_encircled_energy(lens, *scene, radii_um, distance)
         rays = encircled_energy(lens, *scene, waves.radii_um, object_distance=distance)
@@ -173,7 +175,7 @@ class ImagePointViews:
         from dolens.diffraction.point_spread import point_spread
         from dolens.plotting.point_spread import point_spread_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.psf, fields, wavelengths, object_distance, aperture)
         by_waves = huygens_point_spread if kind == "huygens" else point_spread
         found = by_waves(lens, given.fields, given.wavelengths, given.object_distance)
         return shown(point_spread_figure(found, title_of("Point spread functions", lens, given)))

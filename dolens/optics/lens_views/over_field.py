@@ -39,7 +39,7 @@ class OverFieldViews:
         from dolens.analysis.field_curves import field_curves
         from dolens.plotting.field_curves import field_curves_figure
 
-        lens, given = looked_at(self, 0.0, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.field_curves, 0.0, wavelengths, object_distance, aperture)
         distance = given.object_distance
         curves = [
             field_curves(lens, scan, given.wavelengths, distance, distortion)
@@ -70,7 +70,7 @@ class OverFieldViews:
         from dolens.plotting.lateral_colour import lateral_colour_figure
 
         lines = spectral_lines(as_lens(self)) if wavelengths is None else wavelengths
-        lens, given = looked_at(self, 0.0, lines, object_distance, aperture)
+        lens, given = looked_at(self.lateral_colour, 0.0, lines, object_distance, aperture)
         distance, waves = given.object_distance, given.wavelengths
         colour = [
             lateral_colour(lens, scan, waves, distance)
@@ -108,7 +108,7 @@ class OverFieldViews:
         from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
         from dolens.plotting.rms_curves import rms_curves_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.rms, fields, wavelengths, object_distance, aperture)
         distance = given.object_distance
         far = field_scans(lens, distance, edge)[0].fields[-1]
         over_field = rms_against_field(lens, given.wavelengths, far, object_distance=distance)
@@ -138,7 +138,9 @@ class OverFieldViews:
         from dolens.plotting.illumination import illumination_figure
 
         wavelength = wavelength or as_lens(self).primary_wavelength
-        lens, given = looked_at(self, 0.0, wavelength, object_distance, aperture)
+        lens, given = looked_at(
+            self.relative_illumination, 0.0, wavelength, object_distance, aperture
+        )
         distance = given.object_distance
         curves = [
             relative_illumination(lens, scan, wavelength, distance)

@@ -40,7 +40,7 @@ class OverviewViews:
         """Return first-order data, Seidel sums and spot radii; it shows itself as text or HTML."""
         from dolens.analysis.summary import lens_summary
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.summary, fields, wavelengths, object_distance, aperture)
         distance = float("inf") if given.object_distance is None else given.object_distance
         return lens_summary(lens, given.fields, given.wavelengths, distance)
 
@@ -63,7 +63,7 @@ class OverviewViews:
         """
         from dolens.plotting.lens_section import lens_section_figure
 
-        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        lens, given = looked_at(self.draw, fields, wavelengths, object_distance, aperture)
         return shown(
             lens_section_figure(
                 lens,

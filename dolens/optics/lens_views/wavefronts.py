@@ -38,7 +38,7 @@ class WavefrontViews:
         from dolens.plotting.wavefront_maps import wavefront_maps_figure
 
         waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
-        lens, given = looked_at(self, fields, waves, object_distance, aperture)
+        lens, given = looked_at(self.wavefront, fields, waves, object_distance, aperture)
         maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
         return shown(wavefront_maps_figure(maps, title_of("Wavefront error", lens, given)))
 
@@ -67,7 +67,7 @@ class WavefrontViews:
         from dolens.plotting.wavefront_maps import zernike_figure
 
         wavelength = wavelength or as_lens(self).primary_wavelength
-        lens, given = looked_at(self, fields, wavelength, object_distance, aperture)
+        lens, given = looked_at(self.zernike, fields, wavelength, object_distance, aperture)
         maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
         title = title_of("Zernike coefficients", lens, given)
         return shown(zernike_figure(maps, order, terms, title))
@@ -94,7 +94,7 @@ class WavefrontViews:
         from dolens.plotting.strehl import strehl_figure
 
         waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
-        lens, given = looked_at(self, 0.0, waves, object_distance, aperture)
+        lens, given = looked_at(self.strehl, 0.0, waves, object_distance, aperture)
         distance = given.object_distance
         scans = [
             (scan, strehl_ratios(lens, scan, given.wavelengths, distance))
@@ -123,6 +123,6 @@ class WavefrontViews:
         from dolens.plotting.footprint import footprint_figure
 
         wavelength = wavelength or as_lens(self).primary_wavelength
-        lens, given = looked_at(self, fields, wavelength, object_distance, aperture)
+        lens, given = looked_at(self.footprint, fields, wavelength, object_distance, aperture)
         found = footprint(lens, given.fields, wavelength, rays, given.object_distance)
         return shown(footprint_figure(found, title_of("Footprints", lens, given)))
