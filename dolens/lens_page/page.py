@@ -126,12 +126,11 @@ def _with_few_fields(lens: Lens, overview: Overview) -> tuple[Lens, Overview]:
     few = prepared_lens(lens)
     own = few.fields
     assert own is not None  # the usual ones are fewer
+    vignetting, weights = own.vignetting, own.weights
     few.fields = own._replace(
-        **{
-            name: None if values is None else tuple(values[n] for n in chosen)
-            for name, values in own._asdict().items()
-            if name != "kind"
-        }
+        points=tuple(own.points[n] for n in chosen),
+        vignetting=vignetting and tuple(vignetting[n] for n in chosen),
+        weights=weights and tuple(weights[n] for n in chosen),
     )
     return few, lens_overview(few)
 

@@ -63,13 +63,13 @@ def apply_setting(file: ZemaxFile, line: Line) -> None:
         for name in lists:
             _replace(file.system, name, at - 1, value)
     elif operand in OF_WAVELENGTHS:
-        place, lists = OF_WAVELENGTHS[operand]
+        place, older = OF_WAVELENGTHS[operand]
         lines = file.system.get("WAVM", [])
         for n, one in enumerate(lines):
             if one.arguments[:1] == [str(at)]:
                 words = [*one.arguments, "1"][:3]
                 lines[n] = one._replace(arguments=[*words[:place], value, *words[place + 1 :]])
-        for name in lists:
+        for name in older:
             if name in file.system and len(file.system[name][-1].arguments) >= at:
                 _replace(file.system, name, at - 1, value)
     elif operand == "APER":
