@@ -45,8 +45,8 @@ def test_no_page_loads_anything_from_the_network(site):
 def test_the_search_needs_no_server(site):
     """Its index is a script, and its worker a frame: a page from a folder may load no more."""
     assert (site / "search/search_index.js").read_text("utf-8").startswith("var __index")
-    assert (site / "search_frame.js").is_file()
-    assert 'src="search_frame.js"' in (site / "index.html").read_text("utf-8")
+    assert (site / "iframe-worker.js").is_file()
+    assert 'src="iframe-worker.js"' in (site / "index.html").read_text("utf-8")
 
 
 def test_the_api_has_what_a_user_imports(site):
