@@ -22,9 +22,8 @@ TABLE, PICTURE = DOCS / "lenses.md", DOCS / "lenses.png"
 _HEAD = """# Published lenses
 
 dolens comes with {count} prescriptions from patents, books, papers and catalogues. Load one by its
-name, `dolens.load_lens("published/tessar_us2838978")`, look at it with
-`dolens show published/tessar_us2838978`, or see what its tolerances cost:
-`dolens train experiment=cooke_sensitivity lens=published/tessar_us2838978`.
+name, `dolens.load_lens("published/tessar_us2838978")`, and look at it with
+`dolens show published/tessar_us2838978`.
 
 The numbers of the table are those that the source prints. A blank is a number that the source does
 not print, or that was not seen; `Lens.published.note` says what else a reader must know about a
