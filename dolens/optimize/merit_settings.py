@@ -123,7 +123,8 @@ class MeritSettings:
                     raise InputError(
                         f"merit.fields: {list(point)}; allowed: (x, y) in degrees or mm"
                     )
-            check_angles(self.fields, lens, "merit.fields")
+            distance = _given(self.sampling_options).get("object_distance", lens.object_distance)
+            check_angles(self.fields, distance, "merit.fields")
             return self.fields
         if lens.fields is None:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
@@ -205,6 +206,8 @@ class MeritSettings:
             InputError: an unknown quality or option, or nothing that counts.
         """
         operands = [operand(settings, lens) for settings in self.operands]
+        for one in operands:
+            check_angles([one.field], lens.object_distance, f"operand '{one.kind}': field")
         if self.quality is None and not operands:
             raise InputError("merit: there are neither a quality nor operands")
         states = self.states_of(lens)

@@ -189,7 +189,6 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     field = [_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0)]
     if len(field) != 2:
         raise InputError(f"operand '{kind}': field is x and y, not {field}")
-    check_angles([field], lens, f"operand '{kind}': field")
     gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
@@ -204,9 +203,11 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     return Operand(kind, target, low, high, weight, (field[0], field[1]), gaps, states)
 
 
-def check_angles(fields: Sequence[Sequence[float]], lens: Lens, what: str) -> None:
-    """Refuse fields of an object at infinity that are not within 90° of the axis."""
-    for field in fields if lens.object_distance is None else ():
+def check_angles(
+    fields: Sequence[Sequence[float]], object_distance: float | None, what: str
+) -> None:
+    """Refuse fields of an object at infinity (None) that are not within 90° of the axis."""
+    for field in fields if object_distance is None else ():
         if not all(abs(angle) < 90.0 for angle in field):
             raise InputError(f"{what}: {list(field)} degrees; allowed: between -90 and 90")
 

@@ -12,7 +12,7 @@ from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.renamed_keys import RENAMED, Key, Renamed
 from dolens.experiments.running.renaming import explained, refuse_renamed, translated
 from dolens.experiments.running.target_keys import Target, located
-from dolens.experiments.running.training import run
+from tests.experiments.conftest import finished_run
 
 CAMERA = "experiment=wavefront_coding"
 # Names that never were, so that the test says what a table can say.
@@ -133,7 +133,7 @@ def test_the_rate_that_nothing_read_names_the_one_that_is(composed):
 
 
 def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(
-    composed, root, tmp_path, monkeypatch, capfd, dolens_train
+    root, tmp_path, monkeypatch, capfd, dolens_train
 ):
     """The script, on a run folder whose overrides have the names of before.
 
@@ -147,8 +147,9 @@ def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(
         "callbacks.pictures=null",
         "+trainer.enable_progress_bar=false",
     ]
-    run(composed(*kept, "module.spots.pupil.rings=3", "module.spots.pupil.arms=6"))
-    folder = tmp_path / "run"
+    folder = finished_run(
+        root, tmp_path, *kept, "module.spots.pupil.rings=3", "module.spots.pupil.arms=6"
+    )
     old = [*kept, "module.rings=3", "+module.arms=6"]
     (folder / ".hydra/overrides.yaml").write_text("\n".join(f"- '{text}'" for text in old))
     script = root / "scripts/reproduce.py"
