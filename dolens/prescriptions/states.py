@@ -130,7 +130,8 @@ def _state_row(
     found: dict[str, Any] = {"surfaces": surfaces} if surfaces else {}
     if "sensor_distance" in own:
         found["sensor"] = {"distance": whole["sensor"]["distance"]}
-    given = dict(data.given)
+    # What is noted of a stop follows from its numbers.
+    given = {key: value for key, value in data.given.items() if key != "stop_note"}
     if "wavelengths" in given:
         waves = {key: getattr(there, key) for key in _WAVES}
         given |= {key: value for key, value in waves.items() if value is not None}
