@@ -104,7 +104,9 @@ def analyse_tolerances(
     errors = tolerances.draw(lenses, generator)
     counts = weights > 0.0
     started = time.perf_counter()
-    perturbed = trace_perturbed(lens, spots.some(counts), tolerances.names, errors, chunk_size, map_tasks)
+    perturbed = trace_perturbed(
+        lens, spots.some(counts), tolerances.names, errors, chunk_size, map_tasks
+    )
     seconds = time.perf_counter() - started
     return ToleranceAnalysis(
         spots,
