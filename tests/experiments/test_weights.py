@@ -375,7 +375,9 @@ def test_drawn_lenses_are_traced_by_the_spots_that_count(triplet):
     for name in ("worst_offenders", "monte_carlo"):
         for row, other in zip(tables[name], alone[name], strict=True):
             assert row == {
-                key: pytest.approx(value, rel=1e-6, abs=1e-12) if isinstance(value, float) else value
+                key: pytest.approx(value, rel=1e-6, abs=1e-12)
+                if isinstance(value, float)
+                else value
                 for key, value in other.items()
             }
     assert len(tables["sensitivities"]) == 6 * len(alone["sensitivities"])
