@@ -112,7 +112,7 @@ ENTRIES = {
     "wavelengths of a search": called(lambda lens, nm: search(nm)),
     "scene.wavelengths": called(lambda lens, nm: PlanarScene((1000.0,), (nm,))),
     "wavelengths of a chart": called(
-        lambda lens, nm: ChartRays(lens, Chart(1e3, 1, 1, 1.0, 1.0), (nm,))
+        lambda lens, nm: ChartRays(lens, Chart(1e3, 1, 1, 2.0, 1.0), (nm,))
     ),
     "wavelength of a bench": called(lambda lens, nm: Bench(nm, None)),
 }
