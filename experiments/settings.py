@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.experiments.checks import numbers_of
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 
 
@@ -46,6 +47,7 @@ class Spots:
             if not given:
                 raise InputError(f"{key}: none is given")
             object.__setattr__(self, key, given)
+        require_wavelengths(wavelengths, "wavelengths")
 
     def __len__(self) -> int:
         """Return the number of spots."""

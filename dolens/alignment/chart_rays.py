@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dolens.alignment.chart import Chart
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
@@ -54,6 +55,7 @@ class ChartRays:
         for key in ("rings", "arms"):
             if not getattr(self, key) >= 2:
                 raise InputError(f"pupil.{key}: {getattr(self, key)}; allowed: 2 or more")
+        require_wavelengths(self.wavelengths, "wavelengths")
 
     @property
     def pupil(self) -> tuple[float, float]:

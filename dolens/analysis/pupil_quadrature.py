@@ -56,6 +56,26 @@ class SpotRays:
         """Return the number of spots."""
         return len(self.wavelengths)
 
+    def some(self, chosen: Tensor) -> "SpotRays":
+        """Return the spots where `chosen` (S,), bool, is true, with their rays."""
+        if bool(chosen.all()):
+            return self
+        kept = chosen.to(self.spot.device)[self.spot]
+        number, place = chosen.cumsum(0).to(self.spot) - 1, kept.cumsum(0) - 1
+        rays = self.rays
+        waves = torch.as_tensor(rays.wavelength).expand(kept.shape)
+        return replace(
+            self,
+            rays=Rays(rays.position[kept], rays.direction[kept], waves[kept]),
+            spot=number[self.spot[kept]],
+            weight=self.weight[kept],
+            fields=self.fields[chosen],
+            wavelengths=self.wavelengths[chosen],
+            centred=self.centred[chosen],
+            light=self.light[chosen],
+            chief=None if self.chief is None else place[self.chief[chosen]],
+        )
+
 
 def square_grid(
     lens: Lens,

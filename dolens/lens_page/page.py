@@ -127,6 +127,8 @@ def _with_few_fields(lens: Lens, overview: Overview) -> tuple[Lens, Overview]:
     own = few.fields
     assert own is not None  # the usual ones are fewer
     vignetting, weights = own.vignetting, own.weights
+    if weights and not any(weights[n] for n in chosen):
+        weights = None
     few.fields = own._replace(
         points=tuple(own.points[n] for n in chosen),
         vignetting=vignetting and tuple(vignetting[n] for n in chosen),

@@ -278,7 +278,7 @@ class PageSections:
             light = self.overview.spots.valid.double().mean((1, 2))
             bright = light >= _BRIGHT * light.max()
             dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
-            if dim and bool(bright.any()):
+            if dim and bool((bright & (where.field_weights > 0.0)).any()):
                 where = replace(
                     where, fields=where.fields[bright], field_weights=where.field_weights[bright]
                 )

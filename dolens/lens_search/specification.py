@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from dolens.errors import InputError
 from dolens.lens_search.glass.choice import GlassChoice
+from dolens.optics.dispersion import require_wavelengths
 
 # No limit.
 Limit = float | None
@@ -116,6 +117,7 @@ class Specification:
             raise InputError(f"fields must lie from 0 to below 80 degrees: {list(self.fields)}")
         if not self.wavelengths:
             raise InputError("wavelengths: there must be one at least")
+        require_wavelengths(self.wavelengths, "wavelengths")
         if self.reference_wavelength not in (None, *self.wavelengths):
             raise InputError(
                 f"reference_wavelength {self.reference_wavelength} is none of "

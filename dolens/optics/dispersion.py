@@ -24,19 +24,22 @@ _HERZBERGER = 0.028
 SHORTEST, LONGEST = 50.0, 1e7
 
 
-def require_wavelengths(wavelengths: Iterable[float], where: str = "") -> None:
+def require_wavelengths(wavelengths: Iterable[float], where: str = "", unit: str = "nm") -> None:
     """Raise `InputError` where a wavelength in nm is none of light: not from 50 nm to 10 mm.
 
     Args:
         wavelengths: nm.
         where: what the message begins with, a file or a key.
+        unit: in which they were given, `nm` or `µm`; the message names it.
     """
     for wavelength in wavelengths:
         if not SHORTEST <= wavelength <= LONGEST:
             before = f"{where}: " if where else ""
+            given = wavelength if unit == "nm" else 1e-3 * wavelength
+            hint = "0.55 µm is 550" if unit == "nm" else "550 nm is 0.55"
             raise InputError(
-                f"{before}wavelength {wavelength:g} nm: allowed: 50 nm to 10 mm "
-                "(wavelengths are in nm, so 0.55 µm is 550)"
+                f"{before}wavelength {given:g} {unit}: allowed: 50 nm to 10 mm "
+                f"(wavelengths are in {unit}, so {hint})"
             )
 
 

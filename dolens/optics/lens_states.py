@@ -27,6 +27,7 @@ STATE_DATA = (
     "reference_wavelength",
     "wavelength_weights",
     "published",
+    "stop_note",
 )
 
 

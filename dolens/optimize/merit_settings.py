@@ -16,6 +16,7 @@ from dolens.analysis.pupil_quadrature import (
     with_chief_rays,
 )
 from dolens.errors import InputError, check_choice, check_keys
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
@@ -147,6 +148,7 @@ class MeritSettings:
         wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
         if not wavelengths:
             raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
+        require_wavelengths(wavelengths, "merit.wavelengths")
         weights = self.wavelength_weights
         if weights is not None:
             _weights("wavelength_weights", weights, len(wavelengths))

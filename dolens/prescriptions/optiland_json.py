@@ -10,6 +10,7 @@ import re
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.field_data import unequal_weights
@@ -221,6 +222,7 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
         if unit not in _NM:
             raise InputError(f"{where}: a wavelength in '{unit}' (allowed: {', '.join(_NM)})")
         value = round(number(wave, "value", where) * _NM[unit], 9)
+        require_wavelengths([value], f"{where}: 'wavelengths'", "µm" if unit == "um" else "nm")
         values.append(value)
         weights.append(number(wave, "weight", where, 1.0))
         if wave.get("is_primary"):

@@ -11,8 +11,9 @@ It may say numbers of surfaces (thickness, radius, conic, coefficients, clear ap
 decenters of a coordinate break), `sensor.distance`, `object_distance` (`.inf` for infinity),
 fields, wavelengths, one aperture key such as `f_number`, and what the source publishes of it.
 What it does not say is the lens's, the F-number too; `f_number: null` leaves the stop as wide as
-it is in the lens, as a lens has it that is focused.  `temperature` and `pressure` heat the lens, as
-`Lens.at` does.
+it is in the lens, as a lens has it that is focused.  `wavelength_weights` and
+`reference_wavelength` alone are of the lens's wavelengths; `wavelengths` bring their own with them.
+`temperature` and `pressure` heat the lens, as `Lens.at` does.
 What changes the structure, as a type, a glass or the stop, is refused: that is another lens.
 """
 
@@ -129,7 +130,12 @@ def _state_row(
     found: dict[str, Any] = {"surfaces": surfaces} if surfaces else {}
     if "sensor_distance" in own:
         found["sensor"] = {"distance": whole["sensor"]["distance"]}
-    for key, value in data.given.items():
+    # What is noted of a stop follows from its numbers.
+    given = {key: value for key, value in data.given.items() if key != "stop_note"}
+    if "wavelengths" in given:
+        waves = {key: getattr(there, key) for key in _WAVES}
+        given |= {key: value for key, value in waves.items() if value is not None}
+    for key, value in given.items():
         if key == "fields":
             found[key] = field_rows(value)
         elif key == PUBLISHED_KEY:
@@ -197,9 +203,11 @@ def merged_prescription(
         place: its name in messages.
     """
     found = {key: value for key, value in prescription.items() if key != STATES_KEY}
-    for keys in (PUPIL_KEYS, _WAVES):
-        if any(key in overlay for key in keys):
-            found = {key: value for key, value in found.items() if key not in keys}
+    if any(key in overlay for key in PUPIL_KEYS):
+        found = {key: value for key, value in found.items() if key not in PUPIL_KEYS}
+    if "wavelengths" in overlay:
+        # Weights and a reference of other wavelengths say nothing of these.
+        found = {key: value for key, value in found.items() if key not in _WAVES}
     found |= {key: overlay[key] for key in _DATA if key in overlay}
     distance = found.get("object_distance")
     if (

@@ -201,7 +201,10 @@ def _states(
         if row.get(key) != there["surfaces"][n].get(key)
     }
     moved = any(there["sensor"] != lens["sensor"] for there in held.values())
-    system = [key for key in _KEYS if any(t.get(key) != lens.get(key) for t in held.values())]
+    system = {key for key in _KEYS if any(t.get(key) != lens.get(key) for t in held.values())}
+    if system.intersection(_WAVES):
+        # A state's wavelengths bring their weights and their reference with them.
+        system |= set(_WAVES)
     found = {}
     for number, there in held.items():
         rows: dict[str, dict[str, Any]] = {}
@@ -212,13 +215,11 @@ def _states(
         state: dict[str, Any] = {"surfaces": rows} if rows else {}
         if moved:
             state["sensor"] = {"distance": there["sensor"]["distance"]}
-        for key in system:
+        for key in filter(system.__contains__, _KEYS):
             if key in there:
                 state[key] = there[key]
             elif key == "object_distance":
                 state[key] = float("inf")
-            elif key == "wavelength_weights":
-                state[key] = [1.0] * len(there["wavelengths"])
         found[number] = state
     return found
 

@@ -12,6 +12,7 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.fields import Vignetting
 from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.field_data import unequal_weights
@@ -55,6 +56,8 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
         return {}
     places = {n: f"{where}: line {texts[n][2]}" for n in numbers}
     values = [scaled(texts[n][0], _MICROMETRE, places[n]) for n in numbers]
+    for value, n in zip(values, numbers, strict=True):
+        require_wavelengths([value], places[n], "µm")
     weights = [number_in_text(texts[n][1], places[n]) for n in numbers]
     primary = last(file, "PWAV")
     n = 1

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.paraxial_numbers import Number, ParaxialNumbers
 from dolens.optics.system import OpticalSystem
 
@@ -74,11 +75,7 @@ class Scene(ABC):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         if not self.depths or not self.wavelengths:
             raise InputError("scene: depths (mm) and wavelengths (nm) must not be empty")
-        for wavelength in self.wavelengths:
-            if not 100.0 < wavelength < 20000.0:
-                raise InputError(
-                    f"scene: wavelength {wavelength:g} nm is not between 100 and 20000"
-                )
+        require_wavelengths(self.wavelengths, "scene.wavelengths")
 
     @abstractmethod
     def labels(self) -> list[str]:

@@ -22,6 +22,8 @@ from dolens.tolerancing.yields import Yield
 class Outcome:
     """Holds the spots of K lenses with the sensor where it stands, and at each lens's best focus.
 
+    They are the S spots that count, those whose weight is not zero.
+
     Attributes:
         curves: (K, S).
         refocus: (K,), mm, how far the compensator moved the sensor.
@@ -50,6 +52,8 @@ class Outcome:
 @dataclass(frozen=True)
 class ToleranceAnalysis:
     """Holds everything that is known about the tolerances of a lens.
+
+    Spots of weight zero have sensitivities, and are left out of the lenses that are drawn.
 
     Attributes:
         spots: rays of the lens as designed.
@@ -98,8 +102,11 @@ def analyse_tolerances(
     """
     model = linear_spots(lens, spots, tolerances.names)
     errors = tolerances.draw(lenses, generator)
+    counts = weights > 0.0
     started = time.perf_counter()
-    perturbed = trace_perturbed(lens, spots, tolerances.names, errors, chunk_size, map_tasks)
+    perturbed = trace_perturbed(
+        lens, spots.some(counts), tolerances.names, errors, chunk_size, map_tasks
+    )
     seconds = time.perf_counter() - started
     return ToleranceAnalysis(
         spots,
@@ -107,8 +114,8 @@ def analyse_tolerances(
         sensitivities(model, tolerances.steps, weights),
         contributions(model, tolerances, weights),
         errors,
-        Outcome.of(perturbed.curves, weights),
-        Outcome.of(model.focus_curves(errors), weights),
+        Outcome.of(perturbed.curves, weights[counts]),
+        Outcome.of(model.some(counts).focus_curves(errors), weights[counts]),
         perturbed,
         seconds,
     )

@@ -42,6 +42,14 @@ class LinearSpots:
     mixed: Tensor
     tangents: Tensor
 
+    def some(self, chosen: Tensor) -> "LinearSpots":
+        """Return the spots where `chosen` (S,), bool, is true."""
+        of_spots = (
+            *(self.centroids, self.centroid_jacobian),
+            *(self.points, self.mixed, self.tangents),
+        )
+        return LinearSpots(self.names, *(values[chosen] for values in of_spots))
+
     @property
     def rms_radii(self) -> Tensor:
         """Return the RMS radii (S,), mm, of the lens as it is."""

@@ -44,8 +44,10 @@ class Sensitivities:
 
     @property
     def largest_centroid_shift(self) -> Tensor:
-        """Return the shift (P,), mm, of the spot that the tolerance moves farthest."""
-        return self.centroid_shifts.norm(dim=1).amax(0)
+        """Return the shift (P,), mm, of the spot that the tolerance moves farthest, of those whose
+        weight is not zero.
+        """
+        return self.centroid_shifts[self.weights > 0.0].norm(dim=1).amax(0)
 
     def increase(self, refocused: bool = True) -> Tensor:
         """Return how much √(Σ W·RMS²) grows at the worse end of each tolerance, (P,), mm."""

@@ -45,7 +45,14 @@ def set_entrance_pupils(lens: Lens, diameters: Mapping[str | None, float]) -> No
 
 
 def set_aperture(lens: Lens, state: str | None, number: str, aperture: ClearAperture) -> None:
-    """Replace the clear aperture of a surface, in the lens or in one of its states."""
+    """Replace the clear aperture of a surface, in the lens or in one of its states.
+
+    What was noted of a stop that is replaced holds no longer.
+    """
+    if number == str(lens.stop):
+        lens.stop_note = ""
+        for own in map(lens.states.__getitem__, lens.state_names):
+            own.data.given.pop("stop_note", None)
     if state is None:
         lens.surfaces[number].aperture = aperture
     else:
@@ -66,7 +73,7 @@ def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> No
     for number in numbers:
         sizes = {state: found[number] for state, found in edges.items() if number in found}
         largest = ClearAperture(Circle(max(sizes.values())))
-        lens.surfaces[number].aperture = largest
+        set_aperture(lens, None, number, largest)
         for state in lens.state_names:
             own = number == str(lens.stop) and state in sizes
             set_aperture(

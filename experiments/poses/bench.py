@@ -11,6 +11,7 @@ from dolens.alignment.measurement import Measurement, simulated
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 
@@ -44,6 +45,9 @@ class Bench:
     sensor: Sensor
     sources: Sequence[Sequence[float]] = ()
     planes: Sequence[float] = (0.0,)
+
+    def __post_init__(self) -> None:
+        require_wavelengths([self.wavelength], "wavelength")
 
     @property
     def images(self) -> int:

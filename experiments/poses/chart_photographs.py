@@ -15,6 +15,7 @@ from dolens.alignment.chart_photons import ChartLight
 from dolens.alignment.chart_rays import ChartRays
 from dolens.alignment.mark_windows import MarkWindows
 from dolens.alignment.spot_intercepts import one_thread
+from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count, numbers_of
@@ -207,7 +208,7 @@ class ChartPhotographsModule(Analysis):
                 self.restoration,
                 numbers,
                 specimen.camera,
-                self.lens.wavelengths or self.model.rays.wavelengths,
+                self._light_of_scenes(),
                 specimen.generator,
             )
         self.found.append(FittedSpecimen(number, truth, fit, seconds, pictures))
@@ -218,6 +219,11 @@ class ChartPhotographsModule(Analysis):
             fit.degrees_of_freedom,
             seconds,
         )
+
+    def _light_of_scenes(self) -> Sequence[float]:
+        """Return the lens's wavelengths that count (nm), or else those of the chart."""
+        own = self.lens.wavelengths
+        return that_count(self.lens, own)[0].tolist() if own else self.model.rays.wavelengths
 
     def _fit(self, model: ChartModel, seen: MarkWindows, prior: Prior) -> ChartFit:
         rays = model.rays

@@ -63,11 +63,8 @@ def monte_carlo_rows(found: ToleranceAnalysis) -> Iterator[Row]:
     columns = {}
     for name, outcome in (("", found.traced), ("linear_", found.linear)):
         for stage, squares in (("", outcome.after), ("not_refocused_", outcome.before)):
-            counted = squares[:, outcome.weights > 0.0]
-            columns[f"{name}{stage}rms_um"] = (
-                1e3 * (counted @ outcome.weights[outcome.weights > 0.0]).sqrt()
-            )
-            columns[f"{name}{stage}worst_rms_um"] = 1e3 * counted.amax(-1).sqrt()
+            columns[f"{name}{stage}rms_um"] = 1e3 * (squares @ outcome.weights).sqrt()
+            columns[f"{name}{stage}worst_rms_um"] = 1e3 * squares.amax(-1).sqrt()
         columns[f"{name}refocus_um"] = 1e3 * outcome.refocus
     columns["failed_rays"] = found.perturbed.failed
     columns["vignetted"] = found.perturbed.vignetted

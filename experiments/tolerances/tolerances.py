@@ -176,7 +176,8 @@ class TolerancesModule(Analysis):
             traced = numbers[f"tolerance{stage.replace('_', '/', 1)}/rms_um/p90"]
             linear = numbers[f"tolerance/linear{stage}/rms_um/p90"]
             numbers[f"error/linear_p90{stage}"] = abs(linear / traced - 1.0)
-        numbers["cost/rays"] = float(self.monte_carlo.lenses * len(found.spots.weight))
+        traced = int((self.weights > 0.0)[found.spots.spot.cpu()].sum())
+        numbers["cost/rays"] = float(self.monte_carlo.lenses * traced)
         return numbers
 
     def _spot_labels(self) -> list[str]:

@@ -6,7 +6,7 @@ import textwrap
 import pytest
 import torch
 
-from dolens import load_lens
+from dolens import load_lens, save_lens
 from dolens.analysis.conditions import conditions
 from dolens.analysis.encircled_energy import encircled_energy
 from dolens.analysis.modulation_transfer import frequency_range, modulation
@@ -31,7 +31,7 @@ from dolens.lens_page.sections import PageSections
 from dolens.lens_search.sensitivity import lens_sensitivity
 from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.fields import Fields
-from dolens.optimize import MeritSettings
+from dolens.optimize import DesignVariables, MeritSettings
 
 WAVES = (656.2725, 587.5618, 486.1327)
 MIDDLE = WAVES[1]
@@ -307,3 +307,77 @@ def test_field_weights_are_shares_in_means_over_fields(triplet):
     assert spot_table(lens, MeritSettings()).radii == spot_table(triplet, MeritSettings()).radii
     torch.testing.assert_close(of_offenders(lens), of_offenders(triplet))
     torch.testing.assert_close(of_sensitivity(lens), of_sensitivity(triplet))
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("kind", ["yaml", "zmx", "seq"])
+def test_weights_go_with_a_lens_to_other_formats(tmp_path, name, kind):
+    (tmp_path / name).write_text(textwrap.dedent(FILES[name]).strip().format(0, 2, 1) + "\n")
+    lens = load_lens(tmp_path / name)
+    save_lens(lens, tmp_path / f"other.{kind}")
+    other = load_lens(tmp_path / f"other.{kind}")
+    assert other.wavelength_weights == (0.0, 2.0, 1.0)
+    found, wanted = (one.summary().fields[0].rms_spot_um for one in (other, lens))
+    assert found == pytest.approx(wanted, rel=1e-9)
+
+
+def test_weights_of_a_state_are_its_own(tmp_path):
+    """Of the biconvex lens again, 0, 1, 0 is the middle line alone, in that state."""
+    settings = {"WLWT 1": (1, 0), "WLWT 2": (2, 1), "WLWT 3": (1, 0), "FLWT 1": (1, 0)}
+    fields = ("FTYP 0 0 2 3 0 0 0", "XFLN 0 0", "YFLN 0 5", "FWGN 1 3")
+    text = textwrap.dedent(FILES["lens.zmx"]).strip().format(1, 2, 1)
+    for old, new in zip(("FTYP 0 0 1 3 0 0 0", "XFLN 0\n", "YFLN 0\n"), fields, strict=False):
+        text = text.replace(old, new + "\n" * old.endswith("\n"))
+    rows = [f"{name} {n} {w}" for name, both in settings.items() for n, w in enumerate(both, 1)]
+    path = tmp_path / "two.zmx"
+    path.write_text("\n".join((fields[3], text, "MNUM 2 1", *rows, "")))
+    lens = load_lens(path)
+    assert lens.state_names == ("c1", "c2")
+    of_states = {name: lens.in_state(name) for name in lens.state_names}
+    radii = {n: [f.rms_spot_um for f in one.summary().fields] for n, one in of_states.items()}
+    assert radii["c1"] == [f.rms_spot_um for f in lens.summary().fields]
+    assert radii["c1"][0] == pytest.approx(41.5, abs=0.1)
+    assert radii["c2"][0] == pytest.approx(31.48, abs=0.02)
+    alone = copy.deepcopy(of_states["c2"])
+    alone.wavelengths, alone.wavelength_weights = alone.wavelengths[1:2], None
+    assert radii["c2"] == pytest.approx([f.rms_spot_um for f in alone.summary().fields])
+    # In a merit of both states each has the spots, and the weights, that are its own.
+    settings = MeritSettings(sampling_options={"rings": 3, "arms": 6})
+    merit = settings.build(lens, DesignVariables(lens, {"surfaces.1.curvature": None}))
+    for name, there in of_states.items():
+        part, own = merit.parts[name].quality, settings.image_quality(there)
+        torch.testing.assert_close(part.weights, 0.5 * own.weights)
+    assert part.spots.wavelengths.tolist() == [587.6]
+    assert part.spots.fields.tolist() == [[0.0, 5.0]]
+    assert merit.parts["c1"].quality.weights.tolist() == pytest.approx(
+        [w * f / 32 for f in (1, 3) for w in (1, 2, 1)]
+    )
+
+
+def test_drawn_lenses_are_traced_by_the_spots_that_count(triplet):
+    """Tables of sensitivities name the others too."""
+
+    def analysed(fields, waves, weights):
+        lens = weighted(triplet, WAVES, (0, 1, 0))
+        module = TolerancesModule(
+            *(lens, "", "", Spots(fields, waves, PupilRays(2, 6)), weights),
+            *({"surfaces.*.curvature": {"half_range": 1e-4}}, 1.0),
+            *(MonteCarlo(4, None, 0), [20.0]),
+        )
+        numbers = module.analyse()
+        del numbers["cost/lenses_per_s"]
+        return numbers, {name: list(rows) for name, rows in module.tables().items()}
+
+    numbers, tables = analysed(FIELDS, WAVES, [1.0, 0.0])
+    wanted, alone = analysed(FIELDS[:1], [MIDDLE], [1.0])
+    assert numbers == pytest.approx(wanted, rel=1e-9)
+    assert numbers["cost/rays"] == 4 * 12
+    for name in ("worst_offenders", "monte_carlo"):
+        for row, other in zip(tables[name], alone[name], strict=True):
+            assert row == {
+                key: pytest.approx(value, rel=1e-6, abs=1e-12)
+                if isinstance(value, float)
+                else value
+                for key, value in other.items()
+            }
+    assert len(tables["sensitivities"]) == 6 * len(alone["sensitivities"])

@@ -130,3 +130,7 @@ def test_figures_of_many_fields_show_nine_from_the_axis_to_the_edge():
     assert angles[0] == 0.0 and angles[-1] == pytest.approx(19.8) and angles == sorted(angles)
     assert len(few.fields.points) == 9
     assert _with_few_fields(few, about) == (few, about)  # few enough
+    # Where none of the nine has a weight they count alike.
+    lens.fields = lens.fields._replace(weights=tuple(float(n == 5) for n in range(100)))
+    _, about = _with_few_fields(lens, overview)
+    assert about.conditions.field_weights.tolist() == pytest.approx([1.0 / 9.0] * 9)

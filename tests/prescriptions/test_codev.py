@@ -276,7 +276,7 @@ def test_a_value_that_a_solve_wrote_is_kept():
 
 
 def test_zoom_positions_are_said():
-    zoom = "ZOO 2\nZOO THI S2 40 50\nZOO EPD 8 9\nZOO THC S2 100 100"
+    zoom = "ZOO 2\nZOO THI S2 40 50\nZOO EPD 8 9\nZOO THC S2 100 100\nZOO WTW W1 1 0"
     found, said = read_codev(system(*SINGLET, "SI 0 0", zoom, image=""), "lens")
     assert found["sensor"]["distance"] == 40.0
     assert said == ["position 2 of 2 (ZOO); position 1 is read"]

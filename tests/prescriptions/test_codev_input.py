@@ -71,9 +71,17 @@ def test_a_macro_is_no_lens(line, tmp_path):
     require_refused(tmp_path / "lens.seq", text, "is a macro of CODE V")
 
 
-def test_the_first_zoom_position_must_be_the_lens(tmp_path):
-    text = system(*SINGLET, "SI 0 0", "ZOO 2\nZOO THI S2 41 50", image="")
-    require_refused(tmp_path / "lens.seq", text, "position 1 has 41, and the lens 40")
+@pytest.mark.parametrize(
+    ("zoom", "said"),
+    [
+        ("ZOO THI S2 41 50", "ZOO THI: position 1 has 41, and the lens 40"),
+        ("ZOO WTW W1 0 1", "ZOO WTW: position 1 has 0, and the lens 1"),
+        ("ZOO WTF F1 3 1", "ZOO WTF: position 1 has 3, and the lens 1"),
+    ],
+)
+def test_the_first_zoom_position_must_be_the_lens(zoom, said, tmp_path):
+    text = system(*SINGLET, "SI 0 0", f"ZOO 2\n{zoom}", image="")
+    require_refused(tmp_path / "lens.seq", text, said)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """States in prescriptions: read, written, and refused in one line; and in Zemax's files."""
 
+import re
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from dolens.prescriptions.zemax_reader import read_zemax
 from tests.prescriptions.samples import SINGLET
 from tests.prescriptions.zemax_samples import triplet
 
+SPECTRUM = ("wavelengths", "wavelength_weights", "reference_wavelength")
 ZOOM = "published/zoom_us7106520_ex8"
 
 
@@ -23,9 +26,8 @@ def same(one, other):
     assert all(torch.equal(before[name], after[name]) for name in before)
     for name in one.state_names:
         a, b = one.in_state(name), other.in_state(name)
-        assert (a.fields, a.wavelengths, a.object_distance) == (
-            b.fields, b.wavelengths, b.object_distance
-        )  # fmt: skip
+        for what in ("fields", "object_distance", *SPECTRUM):
+            assert getattr(a, what) == getattr(b, what), what
         assert [s.aperture for s in a.surfaces.values()] == [
             s.aperture for s in b.surfaces.values()
         ]
@@ -37,7 +39,7 @@ def test_a_prescription_comes_back_to_the_last_bit():
             half={"surfaces": {"1": {"radius": 21.7, "a4": 2e-6}}, "sensor": {"distance": 29.1}},
             near={"object_distance": 400.0, "fields": {"heights": [[0, 0], [0, 5]]}, "f_number": 4},
             hot={"temperature": 40.0, "pressure": 0.9},
-            blue={"wavelengths": [450.0, 486.0]},
+            blue={"wavelengths": [450.0, 486.0], "wavelength_weights": [1, 2]},
         )
     )
     again = lens_from_prescription(prescription_of(lens))
@@ -94,6 +96,32 @@ def test_a_mistake_takes_one_line(states, said):
         lens_from_prescription(SINGLET | {"states": states})
     assert said in str(refusal.value)
     assert str(refusal.value).startswith("lens: ") and "\n" not in str(refusal.value)
+
+
+def test_a_state_may_say_what_its_lens_s_wavelengths_weigh():
+    """Other wavelengths bring their own weights with them, and a reference."""
+    given = dict(zip(SPECTRUM, ([486.1, 587.6, 656.3], [1.0, 2.0, 1.0], 587.6), strict=True))
+    states = {
+        "middle": {"wavelength_weights": [0, 1, 0]},
+        "alike": {"wavelength_weights": None},
+        "red": {"reference_wavelength": 656.3},
+        "other": {"wavelengths": [500.0, 600.0, 700.0]},
+        "same": given | {"wavelengths": [500.0, 587.6, 700.0]},
+    }
+    lens = lens_from_prescription(SINGLET | given | {"states": states})
+    waves, weights, reference = (tuple(given["wavelengths"]), (1.0, 2.0, 1.0), 587.6)
+    wanted = {
+        "middle": (waves, (0.0, 1.0, 0.0), reference),
+        "alike": (waves, None, reference),
+        "red": (waves, weights, 656.3),
+        "other": ((500.0, 600.0, 700.0), None, 500.0),
+        "same": ((500.0, 587.6, 700.0), weights, reference),
+    }
+    for one in (lens, lens_from_prescription(prescription_of(lens))):
+        for name in states:
+            there = one.in_state(name)
+            assert tuple(getattr(there, what) for what in SPECTRUM) == wanted[name], name
+        same(one, lens)
 
 
 # ---------------------------------------------------------------- Zemax's configurations
@@ -174,6 +202,24 @@ def test_a_configuration_that_cannot_be_held_is_passed_over_and_listed(lines, sa
     assert "states" not in found.prescription
     assert found.passed_over[-1].startswith("the other 1 of 2 configurations, which set")
     assert said in found.passed_over[-1]
+
+
+def test_the_spectrum_of_a_configuration_is_its_own(tmp_path):
+    """Weights that are the lens's stay so where the wavelengths move, and so does the reference."""
+    more = "MNUM 2 1\nWAVE 1 1 0.486\nWAVE 1 2 0.45\nWLWT 3 1 1\nWLWT 3 2 0\n"
+    text = triplet()
+    for n, (wave, weight) in enumerate(((0.486, 1), (0.588, 2), (0.656, 1)), 1):
+        text = re.sub(rf"(?m)^WAVM {n} .*$", f"WAVM {n} {wave} {weight}", text)
+    text = re.sub(r"(?m)^PWAV .*$", "PWAV 2", text)
+    (tmp_path / "lens.zmx").write_text(text + more)
+    lens = load_lens(tmp_path / "lens.zmx")
+    save_lens(lens, tmp_path / "again.zmx")
+    save_lens(lens, tmp_path / "again.yaml")
+    for one in (lens, load_lens(tmp_path / "again.zmx"), load_lens(tmp_path / "again.yaml")):
+        same(one, lens)
+        found = [[getattr(one.in_state(s), what) for what in SPECTRUM] for s in ("c1", "c2")]
+        assert found[0] == [(486.0, 588.0, 656.0), (1.0, 2.0, 1.0), 588.0]
+        assert found[1] == [(450.0, 588.0, 656.0), (1.0, 2.0, 0.0), 588.0]
 
 
 def test_a_solve_is_not_repeated_in_other_configurations():

@@ -6,6 +6,9 @@ import pytest
 import torch
 
 from dolens import InputError
+from dolens.analysis.conditions import conditions
+from dolens.experiments.design.states import set_entrance_pupils
+from dolens.lens_page.tables import first_order_table
 from dolens.prescriptions import lens_from_prescription, prescription_of
 
 SINGLET = {
@@ -74,6 +77,28 @@ def test_an_f_number_closes_the_stop():
 def test_a_pupil_never_opens_the_stop():
     lens = lens_from_prescription(used_with(entrance_pupil_diameter=40.0))
     assert lens.surfaces["2"].semi_diameter == 11.0
+
+
+def test_a_stop_that_is_clipped_says_so_once():
+    """Beside the numbers of the pupil that there is; a rim beyond the pupil takes nothing."""
+    fast, slow = {"entrance_pupil_diameter": 40.0}, {"entrance_pupil_diameter": 3.0}
+    lens = lens_from_prescription(used_with(**slow, states={"fast": fast}))
+    wider = used_with(**slow)
+    wider["surfaces"]["2"] |= {"semi_diameter": 12.0}
+    assert lens.summary() == lens_from_prescription(wider).summary()
+    for one in (lens, lens_from_prescription(prescription_of(lens))):
+        found = one.summary(), one.in_state("fast").summary()
+        assert [round(each.entrance_pupil_diameter, 9) for each in found[:1]] == [3.0]
+        assert found[1].entrance_pupil_diameter < 40.0
+    counts = [repr(each).count("asks for a stop of semi-diameter") for each in found]
+    # What is written is the size that there is, and asks for no more.
+    assert counts == [0, 0]
+    clipped = lens.in_state("fast")
+    assert "the clear aperture of surface 2 has 11 mm" in clipped.stop_note
+    assert repr(clipped.summary()).count(clipped.stop_note) == 1
+    assert first_order_table(clipped, conditions(clipped)).caption.count(clipped.stop_note) == 1
+    set_entrance_pupils(lens, {None: 2.0, "fast": 20.0})
+    assert lens.in_state("fast").stop_note == ""
 
 
 def test_a_pupil_is_enough_to_size_the_stop():

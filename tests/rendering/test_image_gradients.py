@@ -76,6 +76,50 @@ def test_edges_that_clip_the_field_have_their_part_of_the_derivative(root):
         assert row.agrees(0.03), row
 
 
+def test_the_bias_of_a_squared_error_falls_with_the_rays(root):
+    """A render has the error e and the noise ν of its samples: its squared error is e² + E[ν²] on
+    average, and the derivative of E[ν²] is a bias that more rays take away.  Times the error of
+    another render, of its own samples, its derivative has none.
+    """
+    lens, name = triplet(root), "thicknesses.4"
+    start = lens.get_parameter(name).detach()
+    sensor, scene = whole_field(16), PlanarScene((1000.0,), LINES).fixed_for(lens.system())
+    textures = probe_texture(sensor, 3, 0)[:1]
+    truth = pinhole_image(textures, sensor)[:, None]
+
+    def errors(rays, seed, value):
+        return RayRenderer(sensor, rays).render(lens, scene, textures, seed, {name: value}) - truth
+
+    def slope(rays, seed, other=None):
+        value = start.clone().requires_grad_()
+        one = errors(rays, seed, value)
+        factor = one if other is None else 2.0 * errors(rays, other, start)
+        return torch.autograd.grad((one * factor).mean(), value)[0]
+
+    step = 0.04  # mm, so large that samples at edges make little noise
+    with torch.no_grad():
+        up, down = (
+            torch.stack([errors(96, seed, start + way).square().mean() for seed in range(6)])
+            for way in (step, -step)
+        )
+    differences = (up - down) / (2.0 * step)
+    reference = differences.mean()
+    spread = differences.std() / math.sqrt(6.0) / reference.abs()
+    assert float(spread) < 0.01
+    shares = {
+        rays: float(torch.stack([slope(rays, seed) for seed in range(count)]).mean() / reference)
+        for rays, count in ((2, 20), (4, 10), (12, 4))
+    }
+    # See docs/gradients.md.
+    assert 0.75 < shares[2] < 0.88
+    assert 0.90 < shares[4] < 0.97
+    assert abs(shares[12] - 1.0) < 0.02
+    products = torch.stack([slope(2, seed, seed + 20) for seed in range(20)]) / reference
+    noise = math.hypot(float(products.std()) / math.sqrt(20.0), float(spread))
+    assert noise < 0.04
+    assert abs(float(products.mean()) - 1.0) < 2.0 * noise
+
+
 def test_a_wider_stop_blurs_more_by_the_derivative(root):
     # The stop alone limits the light, and its image is the disc that is sampled.
     lens = load_lens(root / "conf/lens/large_fov_doublet.yaml", dtype=torch.float64)

@@ -1,11 +1,21 @@
 """Words of a CODE V `.seq` file that bend no ray are listed; zoom positions are compared."""
 
+import re
+
 from dolens.errors import InputError
 from dolens.prescriptions.codev.file import CodeVFile
 from dolens.prescriptions.decimals import number_in_text
 
 # What the first of several positions must say as the lens itself does.
 _SYSTEM = ("EPD", "FNO", "NA", "NAO")
+# Lists of wavelengths and fields, one number each; `ZOO WTW W2 1 0` is about the second.
+_LISTS = (
+    "WL",
+    "WTW",
+    "WTF",
+    *(f"{axis}{kind}" for axis in "XY" for kind in ("AN", "OB", "IM", "RI")),
+)
+_LISTED = re.compile(r"[WF]([1-9]\d{0,2})")
 
 
 def passed_over(file: CodeVFile) -> list[str]:
@@ -31,13 +41,22 @@ def require_first_position(file: CodeVFile, where: str) -> None:
     """
     for command in file.zoom:
         words = command.words
-        if len(words) < 3 or words[0].upper() not in (*_SYSTEM, "THI"):
+        if len(words) < 3 or words[0].upper() not in (*_SYSTEM, *_LISTS, "THI"):
             continue
         key, label = words[0].upper(), words[1].upper()
         place = f"{where}: line {command.at}: ZOO {key}"
         if key in _SYSTEM:
             own, first = file.system.get(key), words[1]
             value = own[-1].words[0] if own and own[-1].words else None
+        elif key in _LISTS:
+            listed = _LISTED.fullmatch(label)
+            if listed is None:
+                continue
+            numbers, at, first = file.system.get(key), int(listed[1]) - 1, words[2]
+            # Weights that are not written are 1, and coordinates 0.
+            value = "1" if key.startswith("WT") else None if key == "WL" else "0"
+            if numbers and at < len(numbers[-1].words):
+                value = numbers[-1].words[at]
         else:
             block = next((b for b in file.surfaces if b.label == label), None)
             given = block.words[1:2] if block else []

@@ -11,6 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
 from dolens.prescriptions.decimals import exact, nearest, number_in_text, radius_of, scaled
 from dolens.prescriptions.field_data import unequal_weights
@@ -84,6 +85,7 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
     waves = file.system.get("WV")
     if waves:
         values = [scaled(word, _MICROMETRE, f"{where}: WV") for word in waves.words]
+        require_wavelengths(values, f"{where}: WV", "µm")
         found |= {"wavelengths": values, "reference_wavelength": values[0]}
         weights = [number_in_text(w, f"{where}: WW") for w in _words(file.system, "WW")]
         weighed = unequal_weights(weights, len(values), f"{where}: WW")
