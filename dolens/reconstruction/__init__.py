@@ -32,6 +32,11 @@ from dolens.reconstruction.restoration import (
 from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.unrolled_splitting import UnrolledSplittingRestoration
+from dolens.reconstruction.untrained import (
+    UntrainedRestoration,
+    WienerBM3DRestoration,
+    WienerTVRestoration,
+)
 from dolens.reconstruction.wiener import wiener_deconvolve
 
 __all__ = [
@@ -50,8 +55,11 @@ __all__ = [
     "UNet",
     "UNetRestoration",
     "UnrolledSplittingRestoration",
+    "UntrainedRestoration",
     "VGG16Features",
+    "WienerBM3DRestoration",
     "WienerNAFNetRestoration",
+    "WienerTVRestoration",
     "WienerUNetRestoration",
     "field_channels",
     "load_backbone",

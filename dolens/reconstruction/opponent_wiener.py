@@ -77,19 +77,13 @@ class OpponentWiener(nn.Module):
 
     def __init__(self, margin: int, noise_to_signal: Sequence[float], depths: int = 0) -> None:
         super().__init__()
-        ratios = [float(ratio) for ratio in noise_to_signal]
-        if len(ratios) != 3 or not all(r > 0 and math.isfinite(r) for r in ratios):
-            raise InputError(
-                f"noise_to_signal={ratios}: must be three positive numbers, of luminance and of "
-                "both differences of colours"
-            )
+        initial = checked_ratios(noise_to_signal).log()
         if margin < 0:
             raise InputError(f"margin={margin}: must be at least 0 pixels")
         if depths < 0:
             raise InputError(f"depths={depths}: must be at least 0")
         self.margin = margin
         self.depths = depths
-        initial = torch.tensor(ratios).log()
         self.log_noise_to_signal = nn.Parameter(initial.repeat(1 + depths, 1))
 
     @property
@@ -141,12 +135,38 @@ class OpponentWiener(nn.Module):
             each = [correlations(one[None], rows, columns) for one in functions]
             matched = torch.cat([matched, torch.stack([own for own, _ in each])])
             power = torch.cat([power, torch.stack([own for _, own in each])])
-        # From each colour alone: (from, 1 + depths, to, R, C // 2 + 1).
-        colours = torch.eye(3, dtype=power.dtype, device=power.device)[:, None, :, None, None]
-        frequency = squared_frequency(rows, columns, power)
-        ratios = self.log_noise_to_signal.exp()
-        solved = solve_in_opponent_colours(power, frequency, ratios, colours * matched)
-        return solved.permute(1, 2, 0, 3, 4), columns
+        return colour_filters(power, matched, self.log_noise_to_signal.exp(), columns), columns
+
+
+def colour_filters(power: Tensor, matched: Tensor, ratios: Tensor, columns: int) -> Tensor:
+    """Return filters (N, 3, 3, R, C // 2 + 1), complex, to a colour from a colour.
+
+    Args:
+        power: mean |H|², (N, 3, R, C // 2 + 1); see `correlations`.
+        matched: mean H*, likewise.
+        ratios: r, (N, 3); see `solve_in_opponent_colours`.
+        columns: C.
+    """
+    # From each colour alone: (from, N, to, R, C // 2 + 1).
+    colours = torch.eye(3, dtype=power.dtype, device=power.device)[:, None, :, None, None]
+    frequency = squared_frequency(power.shape[-2], columns, power)
+    solved = solve_in_opponent_colours(power, frequency, ratios, colours * matched)
+    return solved.permute(1, 2, 0, 3, 4)
+
+
+def checked_ratios(noise_to_signal: Sequence[float]) -> Tensor:
+    """Return ratios of noise to signal, (3,).
+
+    Raises:
+        InputError: they are not three positive numbers.
+    """
+    ratios = [float(ratio) for ratio in noise_to_signal]
+    if len(ratios) != 3 or not all(r > 0 and math.isfinite(r) for r in ratios):
+        raise InputError(
+            f"noise_to_signal={ratios}: must be three positive numbers, of luminance and of "
+            "both differences of colours"
+        )
+    return torch.tensor(ratios)
 
 
 def check_functions(functions: Tensor, depths: int | None = None) -> None:

@@ -26,11 +26,14 @@ class Restoration(nn.Module):
 
     `needs_point_spread_function` and `needs_field` tell the caller whether to compute the point
     spread functions and the field coordinates at all; where one is False they are ignored and
-    may be None.  `pretrained` tells whether any of the network began with trained weights.
+    may be None.  Where `needs_noise` is True, `forward` takes the sensor's noise besides, (2,): its
+    variance at light x is noise[0]·x + noise[1].  `pretrained` tells whether any of the network
+    began with trained weights.
     """
 
     needs_point_spread_function: ClassVar[bool] = False
     needs_field: bool = False
+    needs_noise: ClassVar[bool] = False
     pretrained: bool = False
 
     def forward(

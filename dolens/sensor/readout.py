@@ -116,6 +116,19 @@ class Readout:
             return self.exposure
         return self.exposure * (self.reference_f_number / self.f_number) ** 2
 
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Return a and b: the variance a·x + b of a developed image at light x, off saturation.
+
+        Interpolated colours of a pattern of filters have less, and neighbours share it.
+        """
+        exposure = self.relative_exposure
+        shot = 0.0 if self.full_well is None else 1.0 / (self.full_well * exposure)
+        step = 0.0
+        if self.bits is not None:
+            step = 1.0 / ((1.0 - self.black_level) * (2**self.bits - 1))
+        return shot, (self.read_noise**2 + step**2 / 12.0) / exposure**2
+
     def __call__(
         self, image: Tensor, generator: torch.Generator, share: BatchShare | None = None
     ) -> Tensor:

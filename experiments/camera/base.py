@@ -69,10 +69,14 @@ class Camera(Experiment):
             functions: point spread functions, or None where the network asks for none.
         """
         field = None if taken.field is None else taken.field.flatten(0, 1)
-        restored = self.network(taken.raw.flatten(0, 1), functions, field)
+        restored = self.network(taken.raw.flatten(0, 1), functions, field, *self.noise())
         # Under autocast a network may end in half precision, in which nothing is to be compared.
         restored = restored.to(self.network.dtype)
         return restored.unflatten(0, taken.raw.shape[:2])
+
+    def noise(self) -> list[Tensor]:
+        """Return the noise of the sensor, (2,), in a list; none where the network asks for none."""
+        return [torch.tensor(self.views.readout.noise)] if self.network.needs_noise else []
 
     def filtered(self, taken: Views, functions: Tensor | None) -> Tensor | None:
         """Return pictures (B, V, 3, H, W) by the network's linear filter alone, display-encoded.

@@ -34,7 +34,7 @@ from dolens.experiments.camera.made_lens_scores import (
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
-from dolens.experiments.camera.restoration_gain import gain_line
+from dolens.experiments.camera.restoration_gain import behind_line, gain_line
 from dolens.experiments.camera.settings import Reconstruction, Training
 from dolens.experiments.camera.training_parts import (
     check_sharing,
@@ -44,7 +44,7 @@ from dolens.experiments.camera.training_parts import (
 from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
-from dolens.reconstruction import psnr_db
+from dolens.reconstruction import UntrainedRestoration, psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
 from dolens.stages import stage as named_stage
 
@@ -175,8 +175,13 @@ class CameraModule(Camera):
         """Compile the network that is to be trained, where that is asked for.
 
         Raises:
-            InputError: torch cannot compile on this machine.
+            InputError: torch cannot compile on this machine, or there is nothing to train.
         """
+        if stage == "fit" and isinstance(self.network, UntrainedRestoration):
+            raise InputError(
+                f"network: {type(self.network).__name__} has nothing to train, and no gradient "
+                "passes it to a lens; allowed: train=false"
+            )
         if self.compiled and stage == "fit":
             compile_network(self.network, self.device)
 
@@ -323,6 +328,9 @@ class CameraModule(Camera):
                 ]
         if "test" in self.test_scores:
             logger.info("%s", gain_line(self.test_scores["test"]))
+            behind = behind_line(self.test_scores["test"])
+            if behind is not None:
+                logger.warning("%s", behind)
 
     def _log_evaluations(self) -> None:
         found = self.evaluation.scores(self.trainer, self.views.labels())

@@ -13,6 +13,7 @@ from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
+from dolens.experiments.camera.untrained_rivals import restored_by_rivals, rival_names
 from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.reconstruction.processes import gathered
@@ -56,6 +57,8 @@ class Evaluation:
             filtered = camera.filtered(taken, functions) if stage == "test" else None
             if filtered is not None:
                 row["linear_psnr_db"] = _compared(psnr_db, filtered.clamp(0.0, 1.0), taken.truth)
+            if stage == "test" and reference is None:
+                row |= _of_rivals(camera, taken, functions, values)
             self._add(name, index, row)
             if reference is None and stage == "test" and functions is not None:
                 self._miscalibrated(camera, values, taken, functions, index)
@@ -118,6 +121,8 @@ class Evaluation:
                 ]
         if hasattr(camera.network, "filtered"):
             found += [f"test{judge}/linear_psnr_db{view}" for judge in judges for view in views]
+        rivals = [f"{name}_{score}" for name in rival_names() for score in ("psnr_db", "ssim")]
+        found += [f"test/{name}{view}" for name in rivals for view in views]
         if camera.network.needs_point_spread_function:
             wrong = [f"psnr_db_miscalibrated/{kind}" for kind in self.miscalibrations]
             found += [f"test/{name}{view}" for name in wrong for view in views]
@@ -189,6 +194,19 @@ def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
             for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
                 row[f"{name}{metric}"] = _compared(measure, image, truth)
     return row
+
+
+def _of_rivals(
+    camera: Camera, taken: Views, functions: Tensor | None, values: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return scores (B, V) of restorers that nothing has trained."""
+    with named_stage("untrained restorers"):
+        images = restored_by_rivals(camera, taken, functions, values)
+    return {
+        f"{name}_{metric}": _compared(measure, image.clamp(0.0, 1.0), taken.truth)
+        for name, image in images.items()
+        for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity))
+    }
 
 
 def together(rows: Rows) -> Rows:

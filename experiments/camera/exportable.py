@@ -155,6 +155,11 @@ def exportable(
     """
     if min(size or (1, 1)) < 1 or (multiple is not None and multiple < 1):
         raise InputError(f"image size {size}, multiple of {multiple}: must be positive numbers")
+    if camera.network.needs_noise:
+        raise InputError(
+            f"network: {type(camera.network).__name__} is no network of tensors alone, and is not "
+            "exported"
+        )
     network = camera.network.eval().requires_grad_(False).cpu()
     sensor = camera.views.sensor
     rows, columns = size or (sensor.height, sensor.width)

@@ -10,12 +10,14 @@ from dolens.experiments.camera.photograph_scores import (
     format_interval,
     statistics_of,
 )
+from dolens.experiments.camera.untrained_rivals import RIVALS
 from dolens.reconstruction.intervals import Interval, gain_interval
 
 # Gains by their names: over which scores of the same test they are, and what those are of.
 OVER = {
     "gain_over_filter_db": ("linear_psnr_db", "the network's own linear filter"),
     "gain_over_raw_db": ("raw_psnr_db", "the sensor's image"),
+    **{f"gain_over_{name}_db": (f"{name}_psnr_db", said) for name, said in RIVALS.items()},
 }
 
 
@@ -75,3 +77,13 @@ def gain_line(scores: PhotographScores) -> str:
         f"Restored images at the worst of {', '.join(scores.views)}: {'; '.join(said)} "
         f"({len(scores.photographs)} photographs, 95 % intervals)"
     )
+
+
+def behind_line(scores: PhotographScores) -> str | None:
+    """Return a sentence that says which untrained restorers are ahead at the worst view, if any."""
+    ahead = [
+        f"{format_interval(gain.interval, 2)} dB over {OVER[gain.name][1]}"
+        for gain in restoration_gains(scores, ["worst"])
+        if gain.name in {f"gain_over_{name}_db" for name in RIVALS} and gain.interval.estimate < 0.0
+    ]
+    return f"The network is behind untrained restorers: {'; '.join(ahead)}" if ahead else None

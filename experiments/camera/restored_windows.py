@@ -10,7 +10,7 @@ common.
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -75,6 +75,7 @@ def margin_of(
     functions: Tensor | None,
     device: torch.device,
     largest: int = _LARGEST_PROBE,
+    noise: Sequence[Tensor] = (),
 ) -> int | None:
     """Measure how far the network looks, in pixels, as a multiple of `GRID`.
 
@@ -83,14 +84,15 @@ def margin_of(
         functions: point spread functions (D, 3, K, K), where the network asks for them.
         device: of both.
         largest: side of the largest probe image, pixels.
+        noise: of the sensor, where the network asks for it; see `Camera.noise`.
 
     Returns:
         The margin; None where the network looks farther than half the largest probe, as one does
-        that measures a whole image's brightness.
+        that measures a whole image's brightness, or has no gradient.
     """
     size = _FIRST_PROBE
     while size <= largest:
-        reach = _reach(network, functions, size, device)
+        reach = _reach(network, functions, size, device, noise)
         # Near the probe's edge less is seen than there would be.
         if reach < size // 2 - GRID // 2:
             return max(GRID, GRID * math.ceil(reach / GRID))
@@ -98,8 +100,17 @@ def margin_of(
     return None
 
 
-def _reach(network: Restoration, functions: Tensor | None, size: int, device: torch.device) -> int:
-    """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones."""
+def _reach(
+    network: Restoration,
+    functions: Tensor | None,
+    size: int,
+    device: torch.device,
+    noise: Sequence[Tensor],
+) -> int:
+    """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones.
+
+    Without a gradient it is not known: all pixels.
+    """
     # In double precision: rounding in a transform would look like an influence of all pixels.
     network = copy.deepcopy(network).double()
     options = {"dtype": torch.float64, "device": device}
@@ -109,7 +120,9 @@ def _reach(network: Restoration, functions: Tensor | None, size: int, device: to
     functions = None if functions is None else functions.double()
     middle, farthest = size // 2, 0
     with evaluating(network), torch.enable_grad():
-        restored = network(raw, functions, field)
+        restored = network(raw, functions, field, *noise)
+        if not restored.requires_grad:
+            return size
         for down, across in _LOOKED_AT:
             row, column = middle + down, middle + across
             (gradient,) = torch.autograd.grad(
@@ -141,6 +154,7 @@ def restore_in_windows(
     field: Tensor | None,
     window: int = DEFAULT_WINDOW,
     margin: int | None = None,
+    noise: Sequence[Tensor] = (),
 ) -> Tensor:
     """Restore an image of any size.
 
@@ -151,6 +165,7 @@ def restore_in_windows(
         field: (1, 2, H, W), where it asks for places.
         window: pixels along each side of what is kept of a window, a multiple of 64.
         margin: see `margin_of`; None: the whole image at once.
+        noise: of the sensor, where the network asks for it; see `Camera.noise`.
 
     Returns:
         (1, 3, H, W), display-encoded, not clipped, in the network's precision.
@@ -163,13 +178,14 @@ def restore_in_windows(
     height, width = raw.shape[-2:]
     with evaluating(network):
         if margin is None:
-            return network(raw, functions, field)
+            return network(raw, functions, field, *noise)
         found = torch.empty(raw.shape, dtype=network.dtype, device=raw.device)
         inner = slice(margin, -margin)
         for part in windows(height, width, window):
             rows = _mirrored(part.rows, margin, height, raw.device)
             columns = _mirrored(part.columns, margin, width, raw.device)
             seen = (..., rows[:, None], columns)
-            restored = network(raw[seen], functions, None if field is None else field[seen])
+            places = None if field is None else field[seen]
+            restored = network(raw[seen], functions, places, *noise)
             found[..., slice(*part.rows), slice(*part.columns)] = restored[..., inner, inner]
     return found

@@ -86,11 +86,13 @@ class PictureCamera:
         with torch.no_grad():
             self.values = {n: v.detach() for n, v in self.camera.variables().items()}
             self.functions = self.camera.functions(self.values)
-        self.margin = margin_of(self.camera.network, self.functions, device)
+        self.margin = margin_of(
+            self.camera.network, self.functions, device, noise=self.camera.noise()
+        )
         if self.margin is None:
             logger.warning(
-                "The network looks farther than 200 pixels around each: pictures are restored as a "
-                "whole"
+                "The network looks farther than 200 pixels around each, or one cannot tell: "
+                "pictures are restored as a whole"
             )
 
     def depths(self) -> list[float]:
@@ -162,7 +164,13 @@ class PictureCamera:
 
     def _restored(self, raw: Tensor, field: Tensor | None) -> Tensor:
         found = restore_in_windows(
-            self.camera.network, raw, self.functions, field, self.options.window, self.margin
+            self.camera.network,
+            raw,
+            self.functions,
+            field,
+            self.options.window,
+            self.margin,
+            self.camera.noise(),
         )
         return found.clamp(0.0, 1.0)
 

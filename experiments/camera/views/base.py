@@ -71,6 +71,8 @@ class Imaging(ABC):
     """
 
     keeps_pupil: ClassVar[bool] = False
+    # Whether a camera knows which view an image is: the place in the field, but not the depth.
+    view_is_known: ClassVar[bool] = False
     # Where the point spread functions are taken, for titles.
     psf_place: ClassVar[str] = "on the axis, at the distances of the scene"
 

@@ -89,6 +89,7 @@ class FieldViews(Imaging):
 
     keeps_pupil = True
     psf_place = "at shares of the sensor's half diagonal"
+    view_is_known = True
 
     def __init__(
         self,

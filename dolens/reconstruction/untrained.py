@@ -1,0 +1,233 @@
+"""Restorers that nothing has trained: Wiener's deconvolution, and a classic of denoising behind it.
+
+Every trained network is to be compared with them.  The deconvolution leaves noise whose strength
+follows the light and whose spectrum is the filter's.  `VarianceStabiliser` makes it even, so that
+one strength of denoising suits dark and bright parts.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.reconstruction.opponent_wiener import (
+    check_functions,
+    checked_ratios,
+    colour_filters,
+    correlations,
+)
+from dolens.reconstruction.restoration import Restoration
+from dolens.reconstruction.variance_stabilising import VarianceStabiliser
+from dolens.reconstruction.wiener import close_periodically, padded_lengths
+from dolens.sensor.colour import linear_to_srgb
+
+Array = NDArray[np.float64]
+
+# The noise's variance that ratios are stated for: 100 electrons in white and a read noise of 3, at
+# a quarter of white, near the mean of photographs.
+REFERENCE_VARIANCE = 0.25 / 100.0 + (3.0 / 100.0) ** 2
+
+
+class UntrainedRestoration(Restoration):
+    """Restore by a Wiener filter in opponent colours and a denoiser behind it.
+
+    Where the depth is unknown the filter is that of least mean error over the depths; see
+    `solve_in_opponent_colours`.  There is nothing to train, and no gradient passes.
+
+    Args:
+        margin: pixels added at each edge for the deconvolution; see `wiener_deconvolve`.
+        noise_to_signal: r of luminance and of both differences of colours, noise over signal power
+            at the Nyquist frequency where the noise's variance is `REFERENCE_VARIANCE`; it grows
+            with the variance.  Less than would be best for the filter alone: what noise that lets
+            through, the denoiser takes.
+
+    Raises:
+        InputError: numbers out of range.
+    """
+
+    needs_point_spread_function: ClassVar[bool] = True
+    needs_noise: ClassVar[bool] = True
+
+    def __init__(self, margin: int, noise_to_signal: Sequence[float]) -> None:
+        super().__init__()
+        if margin < 0:
+            raise InputError(f"margin={margin}: must be at least 0 pixels")
+        self.margin = margin
+        self.ratios: Tensor
+        self.register_buffer("ratios", checked_ratios(noise_to_signal), persistent=False)
+
+    @abstractmethod
+    def denoised(self, image: Array, spectrum: Array) -> Array:
+        """Return an image (H, W, 3) without its noise of unit variance.
+
+        Args:
+            image: with the noise.
+            spectrum: the noise's power by `numpy.fft.fft2`'s frequencies, (H, W, 3), of mean 1.
+        """
+
+    @torch.no_grad()
+    def forward(
+        self,
+        raw: Tensor,
+        point_spread_functions: Tensor | None = None,
+        field: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Restore (B, 3, H, W) linear light to (B, 3, H, W) sRGB; see `Restoration.forward`.
+
+        Raises:
+            InputError: `point_spread_functions` or `noise` is None, or of another shape.
+        """
+        if point_spread_functions is None or noise is None:
+            raise InputError(
+                f"{type(self).__name__} needs the lens's point spread functions and the sensor's "
+                "noise: use a renderer that gives them"
+            )
+        check_functions(point_spread_functions)
+        functions = point_spread_functions.to(raw.device, self.dtype)
+        return torch.stack([self._restored(one, functions, noise) for one in raw.to(self.dtype)])
+
+    def _restored(self, raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor:
+        shot, read = (float(value) for value in noise)
+        # Without noise there is nothing to even out; a thousandth of the reference's is invisible.
+        shot = max(shot, 1e-5)
+        height, width = raw.shape[-2:]
+        ratio = (shot * float(raw.mean().clamp(min=0.0)) + read) / REFERENCE_VARIANCE
+        rows, columns = padded_lengths(height, width, self.margin, functions.shape[-1])
+        matched, power = correlations(functions, rows, columns)
+        filters = colour_filters(power[None], matched[None], ratio * self.ratios[None], columns)[0]
+        spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
+        found = torch.einsum("cduv,duv->cuv", filters, spectrum)
+        light = torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
+        power = noise_power(filters, columns)
+        stabiliser = VarianceStabiliser.of_filtered(shot, read, power.mean(dim=(-2, -1)))
+        image = stabiliser.stabilised(light).permute(1, 2, 0).double().cpu().numpy()
+        colour = resampled_spectrum(power, height, width)
+        clean = torch.from_numpy(np.ascontiguousarray(self.denoised(image, colour))).to(light)
+        return linear_to_srgb(stabiliser.undone(clean.permute(2, 0, 1)))
+
+
+def noise_power(filters: Tensor, columns: int) -> Tensor:
+    """Return the power of each colour's noise behind filters, of white noise of variance 1.
+
+    Args:
+        filters: to a colour from a colour, on the grid of `torch.fft.rfft2`, (3, 3, R, C // 2 + 1).
+        columns: C.
+
+    Returns:
+        (3, R, C), whose mean over the frequencies is the variance.
+    """
+    half = (filters.real**2 + filters.imag**2).sum(dim=1)
+    rows = torch.arange(half.shape[-2], device=half.device)
+    # A real filter has the same power at a frequency and at its opposite.
+    opposite = half[:, -rows % len(rows)][..., 1 : (columns + 1) // 2].flip(-1)
+    return torch.cat([half, opposite], dim=-1)
+
+
+def resampled_spectrum(power: Tensor, height: int, width: int) -> Array:
+    """Return a spectrum (3, R, C) at the frequencies of another size, of mean 1, (H, W, 3).
+
+    The noise's correlation is cut at half the image: what reaches farther cannot be told apart in
+    it.
+    """
+    correlation = torch.fft.ifft2(power.double()).real
+    for dimension, size in ((-2, height), (-1, width)):
+        shifts = torch.fft.fftfreq(size, 1.0 / size).round().long()
+        correlation = correlation.index_select(dimension, shifts.remainder(power.shape[dimension]))
+    spectrum = torch.fft.fft2(correlation).real.clamp(min=0.0)
+    spectrum = spectrum / spectrum.mean(dim=(-2, -1), keepdim=True)
+    return spectrum.permute(1, 2, 0).cpu().numpy()
+
+
+class WienerTVRestoration(UntrainedRestoration):
+    """Restore by Wiener's filter and total variation (Rudin, Osher and Fatemi, Physica D 60, 259).
+
+    It minimises ½‖u - image‖² + weight·TV(u) over all colours at once (Chambolle, J. Math. Imaging
+    Vis. 20, 89), by scikit-image.
+
+    Args:
+        margin: see `UntrainedRestoration`.
+        noise_to_signal: likewise.
+        weight: of the total variation, in the noise's standard deviations.
+    """
+
+    def __init__(
+        self,
+        margin: int = 32,
+        noise_to_signal: Sequence[float] = (0.3, 2.1, 6.0),
+        weight: float = 2.0,
+    ) -> None:
+        super().__init__(margin, noise_to_signal)
+        if not weight > 0.0:
+            raise InputError(f"weight={weight}: must be positive")
+        self.weight = weight
+
+    def denoised(self, image: Array, spectrum: Array) -> Array:
+        """Return the image of least variation near this one; the spectrum is not looked at."""
+        from skimage.restoration import denoise_tv_chambolle
+
+        return denoise_tv_chambolle(image, self.weight, eps=1e-5, max_num_iter=200, channel_axis=-1)
+
+
+class WienerBM3DRestoration(UntrainedRestoration):
+    """Restore by Wiener's filter and block matching (Dabov et al., IEEE Trans. Image Process. 16,
+    2080), which knows the spectrum of the noise (Mäkinen, Azzari and Foi, ibid. 29, 8339).
+
+    By its authors' package `bm3d`, which is free for other than commercial use alone.
+
+    Args:
+        margin: see `UntrainedRestoration`.
+        noise_to_signal: likewise.
+        strength: factor on the noise's variance.
+
+    Raises:
+        InputError: the package is missing.
+    """
+
+    def __init__(
+        self,
+        margin: int = 32,
+        noise_to_signal: Sequence[float] = (0.3, 2.1, 6.0),
+        strength: float = 1.5,
+    ) -> None:
+        super().__init__(margin, noise_to_signal)
+        if not strength > 0.0:
+            raise InputError(f"strength={strength}: must be positive")
+        self.strength = strength
+        if not bm3d_is_installed():
+            raise InputError(
+                "network=wiener_bm3d needs the package bm3d: pip install dolens[bm3d] (its licence "
+                "allows other than commercial use alone)"
+            )
+
+    def denoised(self, image: Array, spectrum: Array) -> Array:
+        """Return the image without noise of this spectrum."""
+        with _numpy_of_bm4d():
+            from bm3d import bm3d_rgb
+
+            return bm3d_rgb(image, self.strength * image[..., 0].size * spectrum)
+
+
+def bm3d_is_installed() -> bool:
+    """Return whether the package `bm3d` is there."""
+    return find_spec("bm3d") is not None
+
+
+@contextmanager
+def _numpy_of_bm4d() -> Iterator[None]:
+    """Give NumPy the old name of `trapezoid` within, which bm4d 4.2.5 calls and NumPy 2.4 lacks."""
+    if hasattr(np, "trapz"):
+        yield
+        return
+    setattr(np, "trapz", np.trapezoid)  # noqa: B010
+    try:
+        yield
+    finally:
+        delattr(np, "trapz")

@@ -1,0 +1,53 @@
+"""Restorers that nothing has trained, beside the network of a camera."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.views.base import Views
+from dolens.reconstruction import Restoration, WienerBM3DRestoration, WienerTVRestoration
+from dolens.reconstruction.untrained import bm3d_is_installed
+
+# By what names of scores begin with, and what these restorers are called.
+RIVALS = {
+    "tv": "Wiener's filter and total variation, which nothing has trained",
+    "bm3d": "Wiener's filter and BM3D, which nothing has trained",
+}
+
+
+def rival_names() -> list[str]:
+    """Return the keys of `RIVALS` that this installation has."""
+    return [name for name in RIVALS if name != "bm3d" or bm3d_is_installed()]
+
+
+@torch.no_grad()
+def restored_by_rivals(
+    camera: Camera, taken: Views, functions: Tensor | None, values: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return images (B, V, 3, H, W), display-encoded, by the name of who restored them.
+
+    They know what a network may know: the sensor's noise and the point spread functions of all
+    views, or of each its own where a camera knows which view an image is.
+
+    Args:
+        camera: whose images they are.
+        taken: what the sensor gave.
+        functions: point spread functions; None where the camera's network asks for none.
+        values: of the lens's variables.
+    """
+    if functions is None:
+        with camera.exact():
+            functions = camera.views.point_spread_functions(camera.lens, values)
+    margin = functions.shape[-1] // 2
+    rivals: dict[str, Restoration] = {"tv": WienerTVRestoration(margin)}
+    if bm3d_is_installed():
+        rivals["bm3d"] = WienerBM3DRestoration(margin)
+    noise = torch.tensor(camera.views.readout.noise)
+    views = range(taken.raw.shape[1])
+    of_view = [functions[v : v + 1] if camera.views.view_is_known else functions for v in views]
+    return {
+        name: torch.stack([rival(taken.raw[:, v], of_view[v], None, noise) for v in views], dim=1)
+        for name, rival in rivals.items()
+    }
