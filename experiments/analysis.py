@@ -19,7 +19,7 @@ class Analysis(Experiment):
         digits: significant digits of the numbers in tables.
     """
 
-    trains: ClassVar[bool] = False
+    trains: bool = False
     digits: ClassVar[int] = 6
 
     def analyse(self) -> Mapping[str, float]:

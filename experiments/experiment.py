@@ -40,7 +40,7 @@ class Experiment(lightning.LightningModule):
         metrics: names of the metrics that a run can have beside its costs; see `metric_names`.
     """
 
-    trains: ClassVar[bool] = True
+    trains: bool = True
     metrics: ClassVar[tuple[str, ...] | None] = None
 
     def __init__(self, lens: Lens, experiment: str, folder: str | Path | None = None) -> None:

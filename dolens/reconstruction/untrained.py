@@ -38,11 +38,11 @@ REFERENCE_VARIANCE = 0.25 / 100.0 + (3.0 / 100.0) ** 2
 class UntrainedRestoration(Restoration):
     """Restore by a Wiener filter in opponent colours and a denoiser behind it.
 
+    Pixels are added at each edge for half of the point spread functions; see `wiener_deconvolve`.
     Where the depth is unknown the filter is that of least mean error over the depths; see
     `solve_in_opponent_colours`.  There is nothing to train, and no gradient passes.
 
     Args:
-        margin: pixels added at each edge for the deconvolution; see `wiener_deconvolve`.
         noise_to_signal: r of luminance and of both differences of colours, noise over signal power
             at the Nyquist frequency where the noise's variance is `REFERENCE_VARIANCE`; it grows
             with the variance.  Less than would be best for the filter alone: what noise that lets
@@ -55,11 +55,8 @@ class UntrainedRestoration(Restoration):
     needs_point_spread_function: ClassVar[bool] = True
     needs_noise: ClassVar[bool] = True
 
-    def __init__(self, margin: int, noise_to_signal: Sequence[float]) -> None:
+    def __init__(self, noise_to_signal: Sequence[float]) -> None:
         super().__init__()
-        if margin < 0:
-            raise InputError(f"margin={margin}: must be at least 0 pixels")
-        self.margin = margin
         self.ratios: Tensor
         self.register_buffer("ratios", checked_ratios(noise_to_signal), persistent=False)
 
@@ -100,7 +97,8 @@ class UntrainedRestoration(Restoration):
         shot = max(shot, 1e-5)
         height, width = raw.shape[-2:]
         ratio = (shot * float(raw.mean().clamp(min=0.0)) + read) / REFERENCE_VARIANCE
-        rows, columns = padded_lengths(height, width, self.margin, functions.shape[-1])
+        size = functions.shape[-1]
+        rows, columns = padded_lengths(height, width, size // 2, size)
         matched, power = correlations(functions, rows, columns)
         filters = colour_filters(power[None], matched[None], ratio * self.ratios[None], columns)[0]
         spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
@@ -153,18 +151,16 @@ class WienerTVRestoration(UntrainedRestoration):
     Vis. 20, 89), by scikit-image.
 
     Args:
-        margin: see `UntrainedRestoration`.
-        noise_to_signal: likewise.
+        noise_to_signal: see `UntrainedRestoration`.
         weight: of the total variation, in the noise's standard deviations.
     """
 
     def __init__(
         self,
-        margin: int = 32,
         noise_to_signal: Sequence[float] = (0.3, 2.1, 6.0),
         weight: float = 2.0,
     ) -> None:
-        super().__init__(margin, noise_to_signal)
+        super().__init__(noise_to_signal)
         if not weight > 0.0:
             raise InputError(f"weight={weight}: must be positive")
         self.weight = weight
@@ -183,8 +179,7 @@ class WienerBM3DRestoration(UntrainedRestoration):
     By its authors' package `bm3d`, which is free for other than commercial use alone.
 
     Args:
-        margin: see `UntrainedRestoration`.
-        noise_to_signal: likewise.
+        noise_to_signal: see `UntrainedRestoration`.
         strength: factor on the noise's variance.
 
     Raises:
@@ -193,11 +188,10 @@ class WienerBM3DRestoration(UntrainedRestoration):
 
     def __init__(
         self,
-        margin: int = 32,
         noise_to_signal: Sequence[float] = (0.3, 2.1, 6.0),
         strength: float = 1.5,
     ) -> None:
-        super().__init__(margin, noise_to_signal)
+        super().__init__(noise_to_signal)
         if not strength > 0.0:
             raise InputError(f"strength={strength}: must be positive")
         self.strength = strength

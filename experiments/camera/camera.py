@@ -124,6 +124,8 @@ class CameraModule(Camera):
             variables or {},
             reconstruction.view_norm,
         )
+        # No gradient passes it to a lens either.
+        self.trains = not isinstance(self.network, UntrainedRestoration)
         self.optimizer, self.scheduler = training.optimizer, training.scheduler
         self.learning_rates = rates = training.learning_rates
         discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
@@ -175,13 +177,8 @@ class CameraModule(Camera):
         """Compile the network that is to be trained, where that is asked for.
 
         Raises:
-            InputError: torch cannot compile on this machine, or there is nothing to train.
+            InputError: torch cannot compile on this machine.
         """
-        if stage == "fit" and isinstance(self.network, UntrainedRestoration):
-            raise InputError(
-                f"network: {type(self.network).__name__} has nothing to train, and no gradient "
-                "passes it to a lens; allowed: train=false"
-            )
         if self.compiled and stage == "fit":
             compile_network(self.network, self.device)
 

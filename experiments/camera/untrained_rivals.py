@@ -40,10 +40,9 @@ def restored_by_rivals(
     if functions is None:
         with camera.exact():
             functions = camera.views.point_spread_functions(camera.lens, values)
-    margin = functions.shape[-1] // 2
-    rivals: dict[str, Restoration] = {"tv": WienerTVRestoration(margin)}
+    rivals: dict[str, Restoration] = {"tv": WienerTVRestoration()}
     if bm3d_is_installed():
-        rivals["bm3d"] = WienerBM3DRestoration(margin)
+        rivals["bm3d"] = WienerBM3DRestoration()
     noise = torch.tensor(camera.views.readout.noise)
     views = range(taken.raw.shape[1])
     of_view = [functions[v : v + 1] if camera.views.view_is_known else functions for v in views]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dolens.experiments.camera.photograph_scores import PhotographScores
-from dolens.experiments.camera.restoration_gain import gain_line, gain_numbers
+from dolens.experiments.camera.restoration_gain import behind_line, gain_line, gain_numbers
 from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
@@ -58,4 +58,36 @@ def test_a_run_says_its_gain(composed, tmp_path, caplog):
     linear = metrics["test/linear_psnr_db/worst"]
     assert metrics["test/gain_over_filter_db/worst"] == pytest.approx(
         metrics["test/psnr_db/worst"] - linear, abs=1e-4
+    )
+
+
+def test_a_network_behind_an_untrained_restorer_is_told_so():
+    behind = scores([[20.0, 21.0], [22.0, 23.0]], [[18.0] * 2] * 2)
+    assert behind_line(behind) is None
+    behind.metrics["tv_psnr_db"] = torch.tensor([[21.0, 22.0], [23.0, 24.0]])
+    assert "-1.00 [-1.00, -1.00] dB over Wiener's filter and total variation" in behind_line(behind)
+    behind.metrics["tv_psnr_db"] = torch.tensor([[19.0, 20.0], [21.0, 22.0]])
+    assert behind_line(behind) is None
+
+
+@pytest.mark.parametrize("network", [["network=unet"], TINY_NETWORK, ["network=wiener_tv"]])
+def test_every_test_has_the_scores_of_an_untrained_restorer(composed, tmp_path, network):
+    untrained = network == ["network=wiener_tv"]
+    run(composed("experiment=wavefront_coding", *TINY, *network, f"train={not untrained}"))
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    for view in ("", "/worst"):
+        found = metrics[f"test/tv_psnr_db{view}"]
+        assert found > metrics[f"test/raw_psnr_db{view}"] - 1.0
+        gain = metrics[f"test/psnr_db{view}"] - found
+        assert metrics[f"test/gain_over_tv_db{view}"] == pytest.approx(gain, abs=1e-4)
+        if untrained:
+            assert gain == pytest.approx(0.0, abs=1e-4)
+
+
+def test_what_nothing_trains_is_not_trained(refused):
+    refused(
+        "train: CameraModule trains nothing; set train=false",
+        "experiment=wavefront_coding",
+        *TINY,
+        "network=wiener_tv",
     )

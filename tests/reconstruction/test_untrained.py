@@ -87,7 +87,7 @@ def test_the_noise_behind_a_filter_has_the_spectrum_that_is_foretold():
 
 def test_a_grey_plane_stays_as_bright_and_loses_its_grain():
     truth = torch.full((3, 96, 96), 0.2)
-    restored = WienerTVRestoration(8)(sensed(truth, disc())[None], disc(), None, NOISE)[0]
+    restored = WienerTVRestoration()(sensed(truth, disc())[None], disc(), None, NOISE)[0]
     grey = float(linear_to_srgb(torch.tensor(0.2)))
     inner = restored[:, 8:-8, 8:-8]
     assert float(inner.mean()) == pytest.approx(grey, abs=2e-3)
@@ -100,8 +100,8 @@ def test_edges_gain_more_than_a_decibel_over_the_filter_alone():
     truth[:, 20:60, 30:80] = torch.tensor([0.7, 0.5, 0.2])[:, None, None]
     raw = sensed(truth, disc())[None]
     encoded = linear_to_srgb(truth)[None]
-    tv = WienerTVRestoration(8)(raw, disc(), None, NOISE).clamp(0.0, 1.0)
-    filtered = WienerTVRestoration(8, (1.0, 7.0, 20.0), 1e-6)(raw, disc(), None, NOISE)
+    tv = WienerTVRestoration()(raw, disc(), None, NOISE).clamp(0.0, 1.0)
+    filtered = WienerTVRestoration((1.0, 7.0, 20.0), 1e-6)(raw, disc(), None, NOISE)
     assert psnr_db(tv, encoded) > psnr_db(filtered.clamp(0.0, 1.0), encoded) + 1.0
 
 
@@ -116,9 +116,7 @@ def test_bm3d_is_told_the_power_of_the_noise_at_every_frequency(monkeypatch):
     monkeypatch.setattr("dolens.reconstruction.untrained.bm3d_is_installed", lambda: True)
     monkeypatch.setitem(sys.modules, "bm3d", SimpleNamespace(bm3d_rgb=bm3d_rgb))
     truth = torch.full((3, 64, 64), 0.3)
-    restored = WienerBM3DRestoration(8, strength=1.0)(
-        sensed(truth, disc())[None], disc(), None, NOISE
-    )
+    restored = WienerBM3DRestoration(strength=1.0)(sensed(truth, disc())[None], disc(), None, NOISE)
     assert float(restored.mean()) == pytest.approx(float(linear_to_srgb(truth).mean()), abs=0.01)
     # Its convention: power of the transform, without a factor; the variance is its mean over N.
     variance = told["spectrum"].mean(axis=(0, 1)) / 64**2
@@ -133,7 +131,7 @@ def test_what_is_missing_is_one_line(monkeypatch):
         WienerBM3DRestoration()
     with pytest.raises(InputError, match="the sensor's noise"):
         WienerTVRestoration()(torch.zeros(1, 3, 16, 16), disc(), None, None)
-    for settings in ({"weight": 0.0}, {"margin": -1}, {"noise_to_signal": [1.0, 0.0, 1.0]}):
+    for settings in ({"weight": 0.0}, {"noise_to_signal": [1.0, 0.0, 1.0]}):
         with pytest.raises(InputError, match=next(iter(settings))):
             WienerTVRestoration(**settings)
 
