@@ -1,4 +1,8 @@
-"""What a lens file holds is used, refused or listed as passed over; no key is read by nobody."""
+"""What a lens file holds changes what its lens computes, or is refused, or listed as passed over.
+
+Each key of the rich files is changed, one after the other.  A key that does none of the three is
+one that nothing reads, and fails the test, unless it has no optical meaning and is named here.
+"""
 
 import json
 import re
@@ -6,136 +10,109 @@ from pathlib import Path
 
 import pytest
 
-from dolens import load_lens
-from dolens.errors import InputError
-from dolens.prescriptions.build import prescription_of
 from dolens.prescriptions.json_lenses import read_json
 from dolens.prescriptions.lens_formats import read_lens
-from tests.prescriptions.codev_samples import TRIPLET as CODE_V_TRIPLET
-from tests.prescriptions.test_oslo import TRIPLET as OSLO_TRIPLET
+from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.read_file import ReadPrescription
+from tests.prescriptions.judged_keys import Verdict, changed_data, changed_text, judge
 
+FILES = Path(__file__).parent / "rich_files"
 PEERS = Path(__file__).parent / "peer_files"
-# A longer distance is infinite.
-FAR = 1e10
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![\w.])")
-# Classes of a program's own objects, beside which its values stand.
-WRAPPERS = ("__instance_type__", "attributes")
 
 
-def leaves(content, place=()):
-    """Yield the place and value of each number, text and truth value of a JSON file."""
-    if isinstance(content, dict | list):
-        entries = content.items() if isinstance(content, dict) else enumerate(content)
-        for key, value in entries:
-            yield from leaves(value, (*place, key))
-    elif content is not None:
-        yield place, content
+def named_by(patterns):
+    """Return what tells whether one of some expressions matches a place, and those that did."""
+    matched = set()
+
+    def is_named(place):
+        text = (
+            place[0] + f" #{place[1]}"
+            if isinstance(place[0], str)
+            and len(place) == 3
+            and isinstance(place[1], int)
+            and isinstance(place[2], str)
+            else ".".join(map(str, place))
+        )
+        found = [pattern for pattern in patterns if re.fullmatch(pattern, text)]
+        matched.update(found)
+        return bool(found)
+
+    return is_named, matched
 
 
-def other(value):
-    if isinstance(value, bool):
-        return not value
-    if isinstance(value, str):
-        return f"{value}x"
-    return 1.01 * value + 0.01 if abs(value) < FAR else -3.0
+def require_complete(verdict: Verdict, patterns, matched):
+    assert verdict.missed == []
+    assert matched == set(patterns), "a key that is named is not there"
 
 
-def fingerprint(content):
-    """Return a file's prescription and what is passed over; None where it is refused."""
-    try:
-        return read_json(json.dumps(content), "lens")
-    except InputError:
-        return None
-
-
-def unnoticed(content):
-    """Return the places whose change is neither seen in the lens, nor refused, nor listed."""
-    before = fingerprint(content)
-    assert before is not None
-    listed = [entry.strip("'").split(".") for entry in before[1]]
-    found = []
-    for place, value in leaves(content):
-        named = [k for k in place if isinstance(k, str) and k not in WRAPPERS]
-        if "__instance_type__" in place or any(named[: len(path)] == path for path in listed):
-            continue
-        inside = content
-        for key in place[:-1]:
-            inside = inside[key]
-        inside[place[-1]] = other(value)
-        if fingerprint(content) == before:
-            found.append((place, value))
-        inside[place[-1]] = value
-    return found
-
-
-@pytest.mark.parametrize("name", ["optiland_rich.json", "ray_optics_rich.roa"])
-def test_each_key_is_used_refused_or_listed(name):
-    assert unnoticed(json.loads((PEERS / name).read_text())) == []
-
-
-# Lines without optical effect: comments, counts, sizes for drawing, and what solves came from.
-@pytest.mark.parametrize(
-    ("name", "text", "silent"),
-    [
-        ("a.len", OSLO_TRIPLET, r"//|NXT|LEN NEW|AP   |CBK|DLRS|END|PY|V "),
-        ("a.seq", CODE_V_TRIPLET, r"RDM;LEN|  CCY"),
-    ],
+# Keys of a prescription without optical meaning: names, and numbers that are printed beside a lens.
+YAML_NAMED = (
+    r"(states\.\w+\.)?published\..*",
+    r"name|source|surfaces\.\d+\.note",
+    # The outermost knot of a spline bounds none of its pieces.
+    r"surfaces\.\d+\.knots_[xy]\.7",
+    # The share of light in a grating's order scales an image, and moves no ray.
+    r"surfaces\.\d+\.phase\.efficiency",
 )
-def test_each_number_of_a_text_is_used_refused_or_listed(name, text, silent):
-    before, missed, at = read_lens(text.encode(), Path(name)), [], 0
-    for line in text.splitlines(keepends=True):
-        for found in NUMBER.finditer(line) if not re.match(silent, line) else ():
-            whole = found[0].lstrip("-").isdecimal()
-            changed = other(int(found[0]) if whole else float(found[0]))
-            begin, end = at + found.start(), at + found.end()
-            put = f"{text[:begin]}{int(changed) + 1 if whole else changed!r}{text[end:]}"
-            try:
-                if read_lens(put.encode(), Path(name)) == before:
-                    missed.append((line, found[0]))
-            except InputError:
-                pass
-        at += len(line)
-    assert missed == []
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "old"),
-    [("a.len", OSLO_TRIPLET, "22.014"), ("a.seq", CODE_V_TRIPLET, "22.014")],
+@pytest.mark.parametrize("name", ["shapes", "system", "apertures"])
+def test_each_key_of_yaml(name):
+    content = plain_values((FILES / f"{name}.yaml").read_text(), name)
+    is_named, _ = named_by(YAML_NAMED)
+    verdict = judge(
+        content,
+        changed_data(content),
+        lambda changed: ReadPrescription(json.loads(json.dumps(changed)), []),
+        is_named,
+        lambda place, listed: False,
+    )
+    print(name, {k: len(v) for k, v in vars(verdict).items()})
+    assert verdict.missed == []
+
+
+# Lines of .zmx, with the number of the word behind #.
+ZEMAX_NAMED = (
+    # Settings of the program: its version, units of other analyses, files that it uses.
+    r"(VERS|PFIL|LANG|SDMA|OMMA|ROPD|HYPR|PICB|GLRS|GSTD|NSCD|COFN) .*",
+    r"UNIT .* #[2-7]",
+    # Names, remarks, and numbers for drawing.
+    r"(NAME|NOTE|COMM|SLAB|MEMA) .*",
+    r"UDAD 0 .* #2|UDAD [1-9] .* #1",
+    # nd and Vd beside the name of a glass: the name decides, and the log says where they differ.
+    r"GLAS [A-Z].* #[2456]",
+    r"GLAS ___BLANK .* #1",
+    # Where the pupil or another aperture sizes a surface, DIAM draws it, and FLAP follows DIAM.
+    r"DIAM (0|0.8|2|3|6.5|7.5|8.2) .* #1|DIAM .* #2|FLAP .* #2",
+    # A gap behind the image.
+    r"DISZ 0 #1",
+    # Lists are filled up beyond the numbers of fields and wavelengths that FTYP gives.
+    r"(XFLN|YFLN|FWGN|VDXN|VDYN|VCXN|VCYN|VANN) .* #([4-9]|1[0-2])",
+    r"WAVM 4 .*|FTYP .* #4",
+    # Any order but 0 is the same, and the status says that the numbers are as they are.
+    r"SCBD 1 .* #3|SCBD 2 .* #[23]",
+    # Nothing is switched on: no tolerances, and one configuration; of two, the current one stands
+    # in the surfaces.
+    r"TOL TOFF .*|(MNUM|MOFF) .*|[A-Z]+ +[0-9] +1 .* #2",
 )
-def test_a_decimal_comma_is_named(name, text, old):
-    with pytest.raises(InputError, match="comma"):
-        read_lens(text.replace(old, "22,014").encode(), Path(name))
 
 
-def test_a_mirror_of_optiland_reflects():
-    """Optiland 0.6 says so in the interaction of the surface."""
-    surfaces = prescription_of(load_lens(PEERS / "optiland_mirror.json"))["surfaces"]
-    assert surfaces["2"]["material"] == "mirror"
+def zemax_listed(place, listed):
+    operand = place[0].split()[0]
+    words = {"TOL": "tolerances", "EFFL": "the merit function"}
+    return any(re.search(rf"\b{words.get(operand, operand)}\b", entry) for entry in listed)
 
 
-def test_an_ideal_lens_of_optiland_has_its_focal_length():
-    rows = prescription_of(load_lens(PEERS / "optiland_thin_lens.json"))["surfaces"]
-    assert rows["2"]["type"] == "paraxial_lens"
-    assert rows["2"]["focal_length"] == 50.0
-
-
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("phase", "PhaseInteractionModel"),
-        ("grating", "DiffractiveInteractionModel"),
-        ("grating2", "DiffractiveInteractionModel"),
-        ("tilt", "tilted"),
-        ("zernike", "shape 'Zernike"),
-        ("toroidal", "shape 'Toroidal"),
-    ],
-)
-def test_what_bends_light_otherwise_is_refused(name, says):
-    with pytest.raises(InputError, match=says):
-        load_lens(PEERS / f"optiland_{name}.json")
-
-
-@pytest.mark.parametrize("key", ["coating", "bsdf"])
-def test_coatings_and_scatter_are_listed(key):
-    listed = read_json((PEERS / f"optiland_{key}.json").read_text(), "lens").passed_over
-    assert any(key in entry for entry in listed)
+@pytest.mark.parametrize("name", ["system.zmx", "configurations.zmx", "axes.zmx"])
+def test_each_number_of_zmx(name):
+    text = (FILES / name).read_text()
+    is_named, _ = named_by(ZEMAX_NAMED)
+    verdict = judge(
+        text,
+        changed_text(text),
+        lambda changed: read_lens(changed.encode(), Path(name)),
+        is_named,
+        zemax_listed,
+    )
+    print(name, {k: len(v) for k, v in vars(verdict).items()})
+    assert verdict.missed == []
