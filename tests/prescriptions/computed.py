@@ -18,6 +18,8 @@ from dolens.optics.rays import Rays
 _POINTS = [[0.0, 0.0], [0.31, 0.73], [-1.17, 0.41], [0.2, -2.3], [2.9, 1.7], [-0.5, 4.1]]
 # A grid of points of a surface, mm.
 _GRID = torch.meshgrid([torch.linspace(-9.0, 9.1, 37, dtype=torch.float64)] * 2, indexing="ij")
+# Sags are asked for within this part of it.
+_REACH = 0.7
 # Points of the stop over its semi-diameter.
 _STOP = [[0.5, 0.6], [-0.3, 0.7], [0.1, -0.8]]
 # Directions of these rays, x and y components.
@@ -32,12 +34,12 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     """Yield what a lens computes, the cheap numbers first; a state of it after the other.
 
     They are: fixed rays through the lens at each of its wavelengths, with their path lengths and
-    validity; margins of its clear apertures, and how large its surfaces are drawn; first-order
+    validity; margins of its clear apertures, and how large its surfaces are drawn; sags; first-order
     numbers; the same rays through the heated lens; spots and chief rays at its own
     fields, with the means over wavelengths and fields that their weights make; its full field.
     """
     there = [lens, *(lens.in_state(name) for name in lens.state_names)]
-    for compute in (_rays, _apertures, _first_order, _hot_rays, _spots, _full_field):
+    for compute in (_rays, _apertures, _first_order, _hot_rays, _sags, _spots, _full_field):
         for one in there:
             yield _numbers(compute, one)
 
@@ -91,6 +93,16 @@ def _apertures(lens: Lens) -> list[Tensor]:
     clear = [s.aperture for s in lens.surfaces.values() if hasattr(s, "aperture")]
     drawn = torch.tensor([aperture.semi_diameter for aperture in clear])
     return [drawn, *(aperture.margin(x, y) for aperture in clear)]
+
+
+def _sags(lens: Lens) -> list[Tensor]:
+    x, y = (_REACH * part for part in _GRID)
+    found = []
+    for surface in lens.surfaces.values():
+        values = {**dict(surface.named_parameters()), **dict(surface.named_buffers())}
+        if not surface.changes_axes:
+            found.append(type(surface).sag_and_gradient(values, x, y)[0])
+    return found
 
 
 def _first_order(lens: Lens) -> list[Tensor]:

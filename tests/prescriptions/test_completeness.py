@@ -103,16 +103,74 @@ def zemax_listed(place, listed):
     return any(re.search(rf"\b{words.get(operand, operand)}\b", entry) for entry in listed)
 
 
-@pytest.mark.parametrize("name", ["system.zmx", "configurations.zmx", "axes.zmx"])
-def test_each_number_of_zmx(name):
+def require_complete_text(name, patterns, is_listed):
     text = (FILES / name).read_text()
-    is_named, _ = named_by(ZEMAX_NAMED)
     verdict = judge(
         text,
         changed_text(text),
         lambda changed: read_lens(changed.encode(), Path(name)),
-        is_named,
-        zemax_listed,
+        named_by(patterns)[0],
+        is_listed,
+    )
+    print(name, {k: len(v) for k, v in vars(verdict).items()})
+    assert verdict.missed == []
+
+
+@pytest.mark.parametrize("name", ["system.zmx", "configurations.zmx", "axes.zmx"])
+def test_each_number_of_zmx(name):
+    require_complete_text(name, ZEMAX_NAMED, zemax_listed)
+
+
+# Lines of .seq and .len without optical meaning: names, remarks, counts.
+CODEV_NAMED = (
+    r"(!|RDM;LEN|TITLE|INI|UID|SLB) .*",
+    # Any word that begins with N says no.
+    r"RDM N .*",
+    # What RDY and THI say afterwards counts.
+    r"S     0.0 -1.0 #[12]",
+)
+OSLO_NAMED = (
+    r"(//|LEN NEW|NXT|END|SNO1) .*",
+    # Where the beam sizes the stop, its aperture draws it, or is larger; so does the object's.
+    r"AP   3.6e\+19 .*|AP   3.86 .*|AP CHK 1.0 .*",
+    # The target of a solve, whose result is written.
+    r"PY .*",
+)
+
+
+def word_listed(place, listed):
+    words = [word for word in re.findall(r"[A-Z][A-Z0-9]+", place[0]) if word != "CIR"]
+    return any(re.search(rf"\b({'|'.join(words) or '-'})\b", entry) for entry in listed)
+
+
+@pytest.mark.parametrize("name", ["system.seq", "axes.seq", "system.len", "near.len"])
+def test_each_word_of_code_v_and_oslo(name):
+    require_complete_text(name, CODEV_NAMED if name.endswith(".seq") else OSLO_NAMED, word_listed)
+
+
+# Of JSON by other programs: classes of a program's own objects, versions, names.
+JSON_NAMED = (
+    r".*__instance_type__.*",
+    # It is compared with the focal length of the surfaces: five per cent more is refused.
+    r"foclen",
+    r"info|name",
+)
+
+
+def json_listed(place, listed):
+    named = ".".join(k for k in place if isinstance(k, str) and k != "attributes")
+    return any(named == path or named.startswith(f"{path}.") for path in (e.strip("'") for e in listed))
+
+
+@pytest.mark.parametrize("name", ["optiland_rich.json", "ray_optics_rich.roa", "deeplens_rich.json"])
+def test_each_key_of_another_program(name):
+    content = json.loads((PEERS / name).read_text())
+    verdict = judge(
+        content,
+        changed_data(content),
+        lambda changed: read_json(json.dumps(changed), name),
+        named_by(JSON_NAMED)[0],
+        json_listed,
     )
     print(name, {k: len(v) for k, v in vars(verdict).items()})
     assert verdict.missed == []

@@ -68,8 +68,9 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     behind = _words(image, "TH")
     gap = gaps[-1] + (exact(behind[0], f"{place}: TH") * factor if behind else 0)
     prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
-    solves = any("SOLVE" in block for block in blocks)
-    return ReadPrescription(prescription, ["solves, whose values are written"] if solves else [])
+    solves = ["solves, whose values are written"] if any("SOLVE" in b for b in blocks) else []
+    groups = [f"{group} ({', '.join(keys)})" for group, keys in file.passed_over.items()]
+    return ReadPrescription(prescription, [*solves, *groups])
 
 
 def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
@@ -89,6 +90,10 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
         weighed = unequal_weights(weights, len(values), f"{where}: WW")
         if weighed:
             found["wavelength_weights"] = weighed
+    for command, key, usual in (("TEM", "temperature", 20.0), ("PRE", "pressure", 1.0)):
+        words = _words(file.system, command)
+        if words and number_in_text(words[0], f"{where}: {command}") != usual:
+            found[key] = float(words[0])
     return found | _field(file, factor, finite, where) | _pupil(file, factor, finite, where)
 
 
