@@ -112,9 +112,9 @@ def changed_data(content: Any) -> Iterator[tuple[tuple, Any]]:
         inside[place[-1]] = value
 
 
-def changed_text(text: str) -> Iterator[tuple[tuple[str, int, str], str]]:
-    """Yield (line, number of the word, word) of each argument in a text of commands, and the text
-    with it changed.
+def words_of(text: str) -> Iterator[tuple[tuple[str, int, str], int, int]]:
+    """Yield (line, number of the word, word) of each argument in a text of commands, and where it
+    begins and ends.
     """
     at = 0
     for line in text.splitlines(keepends=True):
@@ -123,10 +123,22 @@ def changed_text(text: str) -> Iterator[tuple[tuple[str, int, str], str]]:
             word = found[0]
             count = 0 if word in ";&" else count + 1
             if count > 1:
-                begin, end = at + found.start(), at + found.end()
-                place = (line.strip(), count - 1, word)
-                yield place, f"{text[:begin]}{_other_word(word)}{text[end:]}"
+                yield (line.strip(), count - 1, word), at + found.start(), at + found.end()
         at += len(line)
+
+
+def changed_text(text: str) -> Iterator[tuple[tuple[str, int, str], str]]:
+    """Yield the place of each argument of a text, and the text with it changed."""
+    for place, begin, end in words_of(text):
+        yield place, f"{text[:begin]}{_other_word(place[2])}{text[end:]}"
+
+
+def text_with_commas(text: str) -> Iterator[tuple[tuple[str, int, str], str]]:
+    """Yield the place of each number with a decimal point, and the text with a comma there."""
+    for place, begin, end in words_of(text):
+        word = place[2]
+        if re.fullmatch(r"[-+]?\d+\.\d+([eE][-+]?\d+)?", word):
+            yield place, f"{text[:begin]}{word.replace('.', ',')}{text[end:]}"
 
 
 # Another catalogue of glass; a name that is not known may be one that has it.

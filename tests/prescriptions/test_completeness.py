@@ -9,68 +9,36 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
+from dolens import load_lens
+from dolens.errors import InputError
+from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.json_lenses import read_json
 from dolens.prescriptions.lens_formats import read_lens
-from dolens.prescriptions.yaml_text import plain_values
 from dolens.prescriptions.read_file import ReadPrescription
-from tests.prescriptions.judged_keys import Verdict, changed_data, changed_text, judge
+from dolens.prescriptions.yaml_text import plain_values
+from tests.prescriptions.judged_keys import (
+    changed_data,
+    changed_text,
+    judge,
+    leaves,
+    text_with_commas,
+)
 
 FILES = Path(__file__).parent / "rich_files"
 PEERS = Path(__file__).parent / "peer_files"
 
-
-def named_by(patterns):
-    """Return what tells whether one of some expressions matches a place, and those that did."""
-    matched = set()
-
-    def is_named(place):
-        text = (
-            place[0] + f" #{place[1]}"
-            if isinstance(place[0], str)
-            and len(place) == 3
-            and isinstance(place[1], int)
-            and isinstance(place[2], str)
-            else ".".join(map(str, place))
-        )
-        found = [pattern for pattern in patterns if re.fullmatch(pattern, text)]
-        matched.update(found)
-        return bool(found)
-
-    return is_named, matched
-
-
-def require_complete(verdict: Verdict, patterns, matched):
-    assert verdict.missed == []
-    assert matched == set(patterns), "a key that is named is not there"
-
-
-# Keys of a prescription without optical meaning: names, and numbers that are printed beside a lens.
+# Places of prescriptions without optical meaning, with dots between the keys.
 YAML_NAMED = (
-    r"(states\.\w+\.)?published\..*",
+    # Names, and numbers that a source prints beside a lens.
     r"name|source|surfaces\.\d+\.note",
+    r"(states\.\w+\.)?published\..*",
     # The outermost knot of a spline bounds none of its pieces.
     r"surfaces\.\d+\.knots_[xy]\.7",
     # The share of light in a grating's order scales an image, and moves no ray.
     r"surfaces\.\d+\.phase\.efficiency",
 )
-
-
-@pytest.mark.parametrize("name", ["shapes", "system", "apertures"])
-def test_each_key_of_yaml(name):
-    content = plain_values((FILES / f"{name}.yaml").read_text(), name)
-    is_named, _ = named_by(YAML_NAMED)
-    verdict = judge(
-        content,
-        changed_data(content),
-        lambda changed: ReadPrescription(json.loads(json.dumps(changed)), []),
-        is_named,
-        lambda place, listed: False,
-    )
-    print(name, {k: len(v) for k, v in vars(verdict).items()})
-    assert verdict.missed == []
-
-
 # Lines of .zmx, with the number of the word behind #.
 ZEMAX_NAMED = (
     # Settings of the program: its version, units of other analyses, files that it uses.
@@ -90,39 +58,15 @@ ZEMAX_NAMED = (
     r"(XFLN|YFLN|FWGN|VDXN|VDYN|VCXN|VCYN|VANN) .* #([4-9]|1[0-2])",
     r"WAVM 4 .*|FTYP .* #4",
     # Any order but 0 is the same, and the status says that the numbers are as they are.
-    r"SCBD 1 .* #3|SCBD 2 .* #[23]",
+    r"SCBD 1 .* #3|SCBD 2 .* #[23]|PARM 6 1 #2",
+    # Zeros.
+    r"PARM 2 0 #1",
     # Nothing is switched on: no tolerances, and one configuration; of two, the current one stands
     # in the surfaces.
     r"TOL TOFF .*|(MNUM|MOFF) .*|[A-Z]+ +[0-9] +1 .* #2",
 )
-
-
-def zemax_listed(place, listed):
-    operand = place[0].split()[0]
-    words = {"TOL": "tolerances", "EFFL": "the merit function"}
-    return any(re.search(rf"\b{words.get(operand, operand)}\b", entry) for entry in listed)
-
-
-def require_complete_text(name, patterns, is_listed):
-    text = (FILES / name).read_text()
-    verdict = judge(
-        text,
-        changed_text(text),
-        lambda changed: read_lens(changed.encode(), Path(name)),
-        named_by(patterns)[0],
-        is_listed,
-    )
-    print(name, {k: len(v) for k, v in vars(verdict).items()})
-    assert verdict.missed == []
-
-
-@pytest.mark.parametrize("name", ["system.zmx", "configurations.zmx", "axes.zmx"])
-def test_each_number_of_zmx(name):
-    require_complete_text(name, ZEMAX_NAMED, zemax_listed)
-
-
-# Lines of .seq and .len without optical meaning: names, remarks, counts.
 CODEV_NAMED = (
+    # Remarks and names.
     r"(!|RDM;LEN|TITLE|INI|UID|SLB) .*",
     # Any word that begins with N says no.
     r"RDM N .*",
@@ -130,47 +74,195 @@ CODEV_NAMED = (
     r"S     0.0 -1.0 #[12]",
 )
 OSLO_NAMED = (
+    # Remarks, names, and counts.
     r"(//|LEN NEW|NXT|END|SNO1) .*",
     # Where the beam sizes the stop, its aperture draws it, or is larger; so does the object's.
     r"AP   3.6e\+19 .*|AP   3.86 .*|AP CHK 1.0 .*",
     # The target of a solve, whose result is written.
     r"PY .*",
 )
+JSON_NAMED = (
+    # Names, and classes of a program's own objects.
+    r"info|name|.*\.title|.*__instance_type__.*",
+    # It is compared with the focal length of the surfaces, and refused where it is 5 % off.
+    r"foclen",
+    # The direction of an axis has no length.
+    r"surfaces\.\d+\.vec_local\.2",
+    # The only surface of type Aperture is the stop without it.
+    r"surfaces\.2\.is_aperture",
+    # Where the beam sizes the stop, and is smaller.
+    r"surface_group\.surfaces\.1\.aperture\.r_max",
+    r".*\.ifcs\.1\..*\.clear_apertures\.0\.attributes\.radius",
+)
+TEXTS = {
+    "system.zmx": ZEMAX_NAMED,
+    "configurations.zmx": ZEMAX_NAMED,
+    "axes.zmx": ZEMAX_NAMED,
+    "system.seq": CODEV_NAMED,
+    "axes.seq": CODEV_NAMED,
+    "system.len": OSLO_NAMED,
+    "near.len": OSLO_NAMED,
+}
+# Lines whose entry in the list has other words.
+SAID_OTHERWISE = {"TOL": "tolerances", "EFFL": "the merit function"}
 
 
-def word_listed(place, listed):
-    words = [word for word in re.findall(r"[A-Z][A-Z0-9]+", place[0]) if word != "CIR"]
+def name_of(place):
+    if isinstance(place[0], str) and len(place) == 3 and " " in place[0]:
+        return f"{place[0]} #{place[1]}"
+    return ".".join(map(str, place))
+
+
+def is_named_by(patterns):
+    return lambda place: any(re.fullmatch(pattern, name_of(place)) for pattern in patterns)
+
+
+def line_is_listed(place, listed):
+    """Of .zmx the operand, of others a command in the line, but `CIR` has more uses than one."""
+    words = re.findall(r"[A-Z][A-Z0-9]+", place[0])
+    words = [SAID_OTHERWISE.get(word, word) for word in words if word != "CIR"]
     return any(re.search(rf"\b({'|'.join(words) or '-'})\b", entry) for entry in listed)
 
 
-@pytest.mark.parametrize("name", ["system.seq", "axes.seq", "system.len", "near.len"])
-def test_each_word_of_code_v_and_oslo(name):
-    require_complete_text(name, CODEV_NAMED if name.endswith(".seq") else OSLO_NAMED, word_listed)
+def key_is_listed(place, listed):
+    named = ".".join(key for key in place if isinstance(key, str) and key != "attributes")
+    return any(
+        f"{named}.".startswith(f"{path}.") for path in (entry.strip("'") for entry in listed)
+    )
 
 
-# Of JSON by other programs: classes of a program's own objects, versions, names.
-JSON_NAMED = (
-    r".*__instance_type__.*",
-    # It is compared with the focal length of the surfaces: five per cent more is refused.
-    r"foclen",
-    r"info|name",
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small tensors are slower on several."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("name", ["shapes", "system", "apertures"])
+def test_each_key_of_yaml(name):
+    content = plain_values((FILES / f"{name}.yaml").read_text(), name)
+    verdict = judge(
+        content,
+        changed_data(content),
+        lambda changed: ReadPrescription(changed, []),
+        is_named_by(YAML_NAMED),
+        lambda place, listed: False,
+    )
+    assert verdict.missed == []
+    assert len(verdict.used) > 50
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_each_word_of_a_text(name):
+    text = (FILES / name).read_text()
+    verdict = judge(
+        text,
+        changed_text(text),
+        lambda changed: read_lens(changed.encode(), name),
+        is_named_by(TEXTS[name]),
+        line_is_listed,
+    )
+    assert verdict.missed == []
+    for place, changed in text_with_commas(text):
+        if place in verdict.used:
+            with pytest.raises(InputError, match="decimal comma"):
+                read_lens(changed.encode(), name)
+
+
+@pytest.mark.parametrize(
+    "name", ["optiland_rich.json", "ray_optics_rich.roa", "deeplens_rich.json"]
 )
-
-
-def json_listed(place, listed):
-    named = ".".join(k for k in place if isinstance(k, str) and k != "attributes")
-    return any(named == path or named.startswith(f"{path}.") for path in (e.strip("'") for e in listed))
-
-
-@pytest.mark.parametrize("name", ["optiland_rich.json", "ray_optics_rich.roa", "deeplens_rich.json"])
 def test_each_key_of_another_program(name):
     content = json.loads((PEERS / name).read_text())
     verdict = judge(
         content,
         changed_data(content),
         lambda changed: read_json(json.dumps(changed), name),
-        named_by(JSON_NAMED)[0],
-        json_listed,
+        is_named_by(JSON_NAMED),
+        key_is_listed,
     )
-    print(name, {k: len(v) for k, v in vars(verdict).items()})
     assert verdict.missed == []
+    assert len(verdict.used) > 30
+
+
+def test_what_is_named_is_there():
+    """An expression that no key matches any more names nothing."""
+    texts = {name: (FILES / name).read_text() for name in TEXTS}
+    places = {id(YAML_NAMED): [], id(JSON_NAMED): []}
+    for name, text in texts.items():
+        found = places.setdefault(id(TEXTS[name]), [])
+        found += [place for place, _ in changed_text(text)]
+    for file in FILES.glob("*.yaml"):
+        found = plain_values(file.read_text(), file.name)
+        places[id(YAML_NAMED)] += [place for place, _ in leaves(found)]
+    for name in ("optiland_rich.json", "ray_optics_rich.roa", "deeplens_rich.json"):
+        found = json.loads((PEERS / name).read_text())
+        places[id(JSON_NAMED)] += [place for place, _ in leaves(found)]
+    for patterns in (YAML_NAMED, ZEMAX_NAMED, CODEV_NAMED, OSLO_NAMED, JSON_NAMED):
+        for pattern in patterns:
+            for one in pattern.split("|") if "(" not in pattern else [pattern]:
+                assert any(is_named_by([one])(place) for place in places[id(patterns)]), one
+
+
+def test_a_key_that_nothing_reads_is_found():
+    """Of a reader that forgets the weights of wavelengths."""
+    content = plain_values((FILES / "system.yaml").read_text(), "system")
+    weights = {"wavelength_weights": content.pop("wavelength_weights"), "lens": content}
+    verdict = judge(
+        weights,
+        ((place, c) for place, c in changed_data(weights) if place[0] != "lens"),
+        lambda changed: ReadPrescription(changed["lens"], []),
+        lambda place: False,
+        lambda place, listed: False,
+    )
+    assert verdict.missed == [("wavelength_weights", n) for n in range(3)]
+
+
+@pytest.mark.parametrize("name", ["shapes", "system", "apertures"])
+def test_a_decimal_comma_in_yaml_is_named(name):
+    content = plain_values((FILES / f"{name}.yaml").read_text(), name)
+    for place, value in list(leaves(content)):
+        if isinstance(value, float) and not is_named_by(YAML_NAMED)(place):
+            inside = content
+            for key in place[:-1]:
+                inside = inside[key]
+            inside[place[-1]] = f"{value}".replace(".", ",") if "e" not in f"{value}" else "1,5"
+            with pytest.raises(InputError, match="decimal comma"):
+                lens_from_prescription(content)
+            inside[place[-1]] = value
+
+
+def test_a_mirror_of_optiland_reflects():
+    """Optiland 0.6 says so in the interaction of the surface."""
+    surfaces = prescription_of(load_lens(PEERS / "optiland_mirror.json"))["surfaces"]
+    assert surfaces["2"]["material"] == "mirror"
+
+
+def test_an_ideal_lens_of_optiland_has_its_focal_length():
+    rows = prescription_of(load_lens(PEERS / "optiland_thin_lens.json"))["surfaces"]
+    assert rows["2"]["type"] == "paraxial_lens"
+    assert rows["2"]["focal_length"] == 50.0
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("phase", "PhaseInteractionModel"),
+        ("grating", "DiffractiveInteractionModel"),
+        ("grating2", "DiffractiveInteractionModel"),
+        ("tilt", "tilted"),
+        ("zernike", "shape 'Zernike"),
+        ("toroidal", "shape 'Toroidal"),
+    ],
+)
+def test_what_bends_light_otherwise_is_refused(name, says):
+    with pytest.raises(InputError, match=says):
+        load_lens(PEERS / f"optiland_{name}.json")
+
+
+@pytest.mark.parametrize("key", ["coating", "bsdf"])
+def test_coatings_and_scatter_are_listed(key):
+    listed = read_json((PEERS / f"optiland_{key}.json").read_text(), "lens").passed_over
+    assert any(key in entry for entry in listed)

@@ -12,6 +12,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.decimals import exact, nearest, number_in_text, radius_of, scaled
 from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.oslo.text import POWERS, Line, OsloFile, parse_oslo
@@ -36,6 +37,9 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     factor = _factor(file, where)
     target, *blocks, image = file.surfaces
     distance = _object_distance(target, factor, where)
+    place = f"{where}: surface 0 (the object)"
+    seen = {"object_distance": distance, **_field(file, factor, where)}
+    curved = curved_object(seen, _shape(target, factor, place), place)
     prescription = _system(file, factor, distance is not None, where)
     medium = prescription["object_material"] = _medium(target, f"{where}: surface 0")
     if distance is not None:
@@ -70,7 +74,7 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
     solves = ["solves, whose values are written"] if any("SOLVE" in b for b in blocks) else []
     groups = [f"{group} ({', '.join(keys)})" for group, keys in file.passed_over.items()]
-    return ReadPrescription(prescription, [*solves, *groups])
+    return ReadPrescription(prescription, [*solves, *groups, *curved])
 
 
 def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
@@ -94,10 +98,10 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
         words = _words(file.system, command)
         if words and number_in_text(words[0], f"{where}: {command}") != usual:
             found[key] = float(words[0])
-    return found | _field(file, factor, finite, where) | _pupil(file, factor, finite, where)
+    return found | _field(file, factor, where) | _pupil(file, factor, finite, where)
 
 
-def _field(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
+def _field(file: OsloFile, factor: Fraction, where: str) -> dict[str, Any]:
     """Return the axis and the edge of the field."""
     for command, kind, unit in (
         ("ANG", "angles", Fraction(1)),
@@ -145,8 +149,6 @@ def _factor(file: OsloFile, where: str) -> Fraction:
 
 def _object_distance(target: Block, factor: Fraction, where: str) -> float | None:
     place = f"{where}: surface 0 (the object)"
-    if _shape(target, factor, place) != {"type": "plane"}:
-        raise InputError(f"{place}: a curved object is not held")
     _refuse_places(target, place)
     words = _words(target, "TH")
     if not words or abs(number_in_text(words[0], place)) >= _INFINITE:

@@ -16,9 +16,7 @@ _LONGEST_LINE = 20_000
 _MOST_SURFACES = 2000
 _WORD = re.compile(r'"[^"]*"?|[^\s"]+')
 
-SYSTEM = (
-    *("LEN", "UNI", "EBR", "FNO", "NAO", "ANG", "OBH", "GIH", "WV", "WW", "PRE", "TEM"),
-)
+SYSTEM = (*("LEN", "UNI", "EBR", "FNO", "NAO", "ANG", "OBH", "GIH", "WV", "WW", "PRE", "TEM"),)
 SURFACE = (
     *("TH", "RD", "CV", "AP", "GLA", "AIR", "RFL", "RFH", "CC", "AST", "ASP"),
     *("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ"),
