@@ -39,7 +39,7 @@ _OF_THE_SYSTEM: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "ENVD": (_AIR, 3, ()),
 }
 # Of a line of a configuration: behind its value, and the number of a parameter.
-_OF_CONFIGURATIONS = (0.0, 0.0, 1.0, 1.0)
+_OF_CONFIGURATIONS = ("0", "0", "0", "1", "1")
 # TYPE → the numbers of PARM that it has, whatever an earlier TYPE left behind.
 _PARAMETERS = {"STANDARD": range(0), "COORDBRK": range(1, 7)}
 # The switch of HIDE that leaves a surface out.
@@ -62,9 +62,10 @@ def further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
         if words[2:3] != ["1"] and tuple(map(_number, words[:2])) != _USUAL_AIR[: len(words)]:
             yield _AIR, "ENVD"
     for line in configuration_lines(file):
-        if _says([*line.arguments[3:4], *line.arguments[5:]], _OF_CONFIGURATIONS):
-            yield "solves and pick-ups of configurations", line.operand
-        elif line.operand != "PRAM" and _says(line.arguments[4:5], ()):
+        words = list(line.arguments[3:])
+        if line.operand == "PRAM":
+            words[1:2] = ["0"]  # which parameter it is
+        if _says(words, _OF_CONFIGURATIONS):
             yield "solves and pick-ups of configurations", line.operand
     last = len(file.surfaces) - 1
     for number, block in enumerate(file.surfaces):

@@ -34,12 +34,13 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     """Yield what a lens computes, the cheap numbers first; a state of it after the other.
 
     They are: fixed rays through the lens at each of its wavelengths, with their path lengths and
-    validity; margins of its clear apertures, and how large its surfaces are drawn; sags; first-order
-    numbers; the same rays through the heated lens; spots and chief rays at its own
-    fields, with the means over wavelengths and fields that their weights make; its full field.
+    validity; margins of its clear apertures, and how large its surfaces are drawn; first-order
+    numbers; the same rays through the heated lens; sags; vignetting and paraxial chief rays of its
+    own fields; their spots and real chief rays, with the means over wavelengths and fields that
+    their weights make; its full field.
     """
     there = [lens, *(lens.in_state(name) for name in lens.state_names)]
-    for compute in (_rays, _apertures, _first_order, _hot_rays, _sags, _spots, _full_field):
+    for compute in (_rays, _apertures, _first_order, _hot_rays, _sags, _beams, _spots, _full_field):
         for one in there:
             yield _numbers(compute, one)
 
@@ -114,12 +115,20 @@ def _hot_rays(lens: Lens) -> list[Tensor]:
     return _rays(lens.at(_HOT))
 
 
+def _beams(lens: Lens) -> list[Tensor]:
+    seen = conditions(lens)
+    paraxial = [
+        lens.paraxial_rays(height, lens.primary_wavelength, seen.object_distance).chief.height
+        for height in seen.fields.flatten().tolist()
+    ]
+    return [vignetting_margin(lens.fields, seen.fields, seen.fields.new_tensor(_STOP)), *paraxial]
+
+
 def _spots(lens: Lens) -> list[Tensor]:
     seen = conditions(lens)
     spots = spot_diagram(lens, seen.fields, seen.wavelengths, _RAYS, seen.object_distance)
     square = spots.polychromatic_rms.square()
-    beams = vignetting_margin(lens.fields, seen.fields, seen.fields.new_tensor(_STOP))
-    return [beams, spots.rms, spots.chief, square, (seen.field_weights * square).sum()]
+    return [spots.rms, spots.chief, square, (seen.field_weights * square).sum()]
 
 
 def _full_field(lens: Lens) -> list[Tensor]:

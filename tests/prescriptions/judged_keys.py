@@ -55,7 +55,7 @@ def judge(
     before = read(content)
     # Plain data are changed in their place.
     kept = copy.deepcopy(before.prescription)
-    own, verdict = Computed(lens_from_prescription(kept)), Verdict()
+    own, verdict = Computed(lens_from_prescription(kept, backend="cpu")), Verdict()
     for place, changed in changes:
         if is_named(place):
             verdict.named.append(place)
@@ -63,7 +63,7 @@ def judge(
         try:
             found = read(changed)
             differs = found.prescription != kept and own.differs(
-                lens_from_prescription(found.prescription)
+                lens_from_prescription(found.prescription, backend="cpu")
             )
         except InputError:
             verdict.refused.append(place)
