@@ -21,7 +21,8 @@ _NOTHING = (0.0, '""')
 # programs always write behind them; after that, zeros and empty texts.
 _OF_SURFACES: dict[str, tuple[str, int, tuple[str, ...]]] = {
     **{key: (_SOLVES, 1, ()) for key in ("CURV", "CONI", "DISZ")},
-    **{key: (_SOLVES, 2, ()) for key in ("PARM", "XDAT")},
+    "PARM": (_SOLVES, 2, ()),
+    "XDAT": (_SOLVES, 2, ("0", "0", "1")),
     **{key: (_APERTURES, 2, ()) for key in ("CLAP", "FLAP", "SQAP", "ELAP", "OBSC", "SQOB")},
     **{key: (_APERTURES, 2, ()) for key in ("ELOB", "SPID", "OBDC")},
     **{key: (_APERTURES, 0, ()) for key in ("USAP", "USOB")},
@@ -38,8 +39,8 @@ _OF_THE_SYSTEM: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "RAIM": ("ray aiming, which is always on here", 2, ("1", "1", "0", "0", "0", "0", "0", "1")),
     "ENVD": (_AIR, 3, ()),
 }
-# Of a line of a configuration: behind its value, and the number of a parameter.
-_OF_CONFIGURATIONS = ("0", "0", "0", "1", "1")
+# Behind the value of a configuration, by newer and by older programs.
+_OF_CONFIGURATIONS = (("0", "0", "0", "1", "1"), ("0", "0", "0", "1", "1", "1"))
 # TYPE → the numbers of PARM that it has, whatever an earlier TYPE left behind.
 _PARAMETERS = {"STANDARD": range(0), "COORDBRK": range(1, 7)}
 # The switch of HIDE that leaves a surface out.
@@ -65,7 +66,7 @@ def further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
         words = list(line.arguments[3:])
         if line.operand == "PRAM":
             words[1:2] = ["0"]  # which parameter it is
-        if _says(words, _OF_CONFIGURATIONS):
+        if all(_says(words, usual) for usual in _OF_CONFIGURATIONS):
             yield "solves and pick-ups of configurations", line.operand
     last = len(file.surfaces) - 1
     for number, block in enumerate(file.surfaces):
