@@ -195,8 +195,9 @@ def _tested(
     if not settings.trainer.get("enable_progress_bar", True):
         unwanted = (ModelCheckpoint, ProgressBar)
     kept = [callback for callback in callbacks if not isinstance(callback, unwanted)]
+    own = {"callbacks": kept, "logger": False, "enable_checkpointing": False}
     trainer: lightning.Trainer = run.made(
-        "trainer", settings.trainer, callbacks=kept, logger=False, enable_checkpointing=False
+        "trainer", settings.trainer, **own, **_one_process(settings.trainer)
     )
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))
@@ -216,6 +217,16 @@ def _tested(
     metrics = dict(trainer.callback_metrics) | summary_of(run.module)
     metrics["cost/peak_memory_mb"] = peak_memory_mb(device)
     return metrics
+
+
+def _one_process(trainer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of the trainer by which no other process is started, whatever the run had.
+
+    One device that is chosen by its number stays.
+    """
+    devices = trainer.get("devices")
+    chosen = isinstance(devices, Sequence) and not isinstance(devices, str) and len(devices) == 1
+    return {"devices": list(devices) if chosen else 1, "num_nodes": 1, "strategy": "auto"}
 
 
 @contextmanager
