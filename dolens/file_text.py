@@ -1,8 +1,12 @@
-"""Files that a user or a stranger names are read and decoded, whatever system wrote them."""
+"""Files that a user or a stranger names are read and decoded, whatever system wrote them.
+
+Paths that they name are looked at before anything is done with them.
+"""
 
 import codecs
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from dolens.errors import InputError
@@ -45,6 +49,55 @@ def read_file(path: str | Path, most_bytes: int, what: str = "lens file") -> byt
     if len(data) > most_bytes:
         raise InputError(f"{path}: is larger than {most_bytes // 2**20} MB, and no {what}")
     return data
+
+
+def resolved_path(path: str | Path) -> Path:
+    """Return a path from the root on, with links followed and `~` as the home; nothing needs to be
+    there.
+
+    Raises:
+        InputError: no file system has such a path, or the links in it lead in a circle; one line
+            that names it.
+    """
+    try:
+        found = Path(path).expanduser().resolve()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            found.stat()
+    except OSError as error:
+        raise InputError(f"{path}: is no path ({error.strerror or error})") from None
+    except (ValueError, RuntimeError):  # a zero byte, half of a surrogate pair; a home of nobody
+        raise InputError(f"{path}: is no path of a file") from None
+    return found
+
+
+def check_written(path: Path | None, option: str, folder: bool = False) -> None:
+    """Refuse a path that nothing can be written to, before the work whose result goes there.
+
+    Args:
+        path: of a file, which may be there, or of a folder; None is taken as it is.
+        option: that names it; the message begins with it.
+        folder: whether it is one.
+
+    Raises:
+        InputError: it is a folder, a pipe or a device in the place of a file, or the reverse; a
+            folder of it is none; or the system says no.
+    """
+    if path is None:
+        return
+    try:
+        state = resolved_path(path).stat()
+        if folder and not stat.S_ISDIR(state.st_mode):
+            raise InputError(f"{path}: is no folder")
+        if not folder:
+            _require_file(state, path, "file to write to")
+        if not os.access(path, os.W_OK):
+            raise InputError(f"{path}: cannot be written (Permission denied)")
+    except FileNotFoundError:
+        check_written(resolved_path(path).parent, option, folder=True)
+    except InputError as error:
+        raise InputError(f"{option}: {error}") from None
+    except OSError as error:
+        raise InputError(f"{option}: {path}: cannot be written ({error.strerror})") from None
 
 
 def _require_file(state: os.stat_result, path: str | Path, what: str) -> None:

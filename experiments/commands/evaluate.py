@@ -40,6 +40,7 @@ from dolens.experiments.running.run_folder import (
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import summary_of
 from dolens.experiments.running.trust import own_folder
+from dolens.file_text import resolved_path
 from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)
@@ -138,7 +139,10 @@ def _new_folder(folder: Path, name: str | None) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") if name is None else name
     if not name or Path(name).name != name:
         raise InputError(f"--name: '{name}'; allowed: the name of a folder, without /")
-    found = own_folder(folder, "evaluation") / name
+    try:
+        found = resolved_path(own_folder(folder, "evaluation") / name)
+    except InputError as error:
+        raise InputError(f"--name: {error}") from None
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found
