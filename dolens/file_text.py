@@ -19,6 +19,8 @@ _OTHERS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+# Of a file or a folder, in bytes.
+_LONGEST_NAME = 255
 _AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -61,8 +63,12 @@ def resolved_path(path: str | Path) -> Path:
     """
     try:
         found = Path(path).expanduser().resolve()
+        if any(len(os.fsencode(part)) > _LONGEST_NAME for part in found.parts):
+            raise InputError(f"{path}: is no path (File name too long)")
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             found.stat()
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: is no path ({error.strerror or error})") from None
     except (ValueError, RuntimeError):  # a zero byte, half of a surrogate pair; a home of nobody

@@ -61,7 +61,8 @@ class Options:
             raise InputError(f"--seed: {self.seed}; allowed: 0 to 2^63 - 1")
         if self.scale is not None and not _SMALLEST_SCALE <= self.scale <= _LARGEST_SCALE:
             raise InputError(
-                f"--scale: {self.scale:g}; allowed: {_SMALLEST_SCALE:g} to {_LARGEST_SCALE:g} pixels"
+                f"--scale: {self.scale:g}; allowed: {_SMALLEST_SCALE:g} to "
+                f"{_LARGEST_SCALE:g} pixels"
             )
         if not all(0.0 < depth < math.inf for depth in self.depths):
             raise InputError(f"--depth: {self.depths}; allowed: positive numbers, mm")

@@ -137,7 +137,7 @@ def own_metrics(found: Evaluated) -> dict[str, float]:
 
 def _new_folder(folder: Path, name: str | None) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") if name is None else name
-    if not name or Path(name).name != name:
+    if not name or Path(name).name != name or not name.isprintable():
         raise InputError(f"--name: '{name}'; allowed: the name of a folder, without /")
     try:
         found = resolved_path(own_folder(folder, "evaluation") / name)
