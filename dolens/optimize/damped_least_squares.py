@@ -256,9 +256,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
             if not found.numel():
                 raise InputError("least squares: there are no residuals")
             if found.is_complex():
-                raise InputError(
-                    "least squares: the residuals are complex; give both parts of each"
-                )
+                raise InputError("least squares: the residuals are complex; give their parts")
             return TensorResiduals(found, self._variables)
         if not isinstance(found, Residuals):
             raise InputError(

@@ -9,6 +9,7 @@ from dolens.experiments.camera.restored_windows import (
     DEFAULT_WINDOW,
     GRID,
 )
+from dolens.experiments.camera.views.whole import DIFFRACTION
 from dolens.sensor.image_files import MEGAPIXELS
 
 # Pixels of a picture to one of the sensor.
@@ -66,11 +67,15 @@ class Options:
             )
         if not all(0.0 < depth < math.inf for depth in self.depths):
             raise InputError(f"--depth: {self.depths}; allowed: positive numbers, mm")
-        if not self.megapixels > 0.0:
+        if not 0.0 < self.megapixels < math.inf:
             raise InputError(f"--megapixels: {self.megapixels:g}; allowed: above 0")
         for level in ("black", "white"):
             if not math.isfinite(getattr(self, f"{level}_level") or 0.0):
                 raise InputError(f"--{level}-level: must be a finite number")
+        if self.white_level is not None and not self.white_level > (self.black_level or 0.0):
+            raise InputError(f"--white-level: {self.white_level:g}; allowed: above black")
+        if self.diffraction is not None:
+            check_choice(self.diffraction, DIFFRACTION, "--diffraction")
         if not self.raw and (self.black_level, self.white_level) != (None, None):
             raise InputError("--black-level and --white-level are of raw files; give --raw too")
         if self.raw and (self.depths or self.scale or self.diffraction or self.save_raw):
