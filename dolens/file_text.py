@@ -4,9 +4,11 @@ Paths that they name are looked at before anything is done with them.
 """
 
 import codecs
+import gc
 import os
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dolens.errors import InputError
@@ -51,6 +53,21 @@ def read_file(path: str | Path, most_bytes: int, what: str = "lens file") -> byt
     if len(data) > most_bytes:
         raise InputError(f"{path}: is larger than {most_bytes // 2**20} MB, and no {what}")
     return data
+
+
+@contextmanager
+def much_at_once() -> Iterator[None]:
+    """Let Python not look for circles among what is read, over all of it again and again.
+
+    There are none in the values of a file, and with many of them nothing else would take as long.
+    """
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
 
 
 def resolved_path(path: str | Path) -> Path:

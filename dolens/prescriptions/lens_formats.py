@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text
+from dolens.file_text import decode_text, much_at_once
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
@@ -140,7 +140,8 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
         )
     if chosen.name == "dO text":
         text = _utf_8(data, where, "text")
-    return chosen.read(text, where)
+    with much_at_once():
+        return chosen.read(text, where)
 
 
 def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
