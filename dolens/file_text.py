@@ -10,6 +10,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from unicodedata import category
 
 from dolens.errors import InputError
 
@@ -21,6 +22,8 @@ _OTHERS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+# Unicode's categories: control characters, halves of surrogate pairs, ends of lines and paragraphs.
+_CONTROLS = ("Cc", "Cs", "Zl", "Zp")
 # Of a file or a folder, in bytes.
 _LONGEST_NAME = 255
 _AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
@@ -127,6 +130,13 @@ def _require_file(state: os.stat_result, path: str | Path, what: str) -> None:
     for holds, kind in _OTHERS:
         if holds(state.st_mode):
             raise InputError(f"{path}: is {kind}, no {what}")
+
+
+def without_controls(text: str) -> str:
+    """Return a text with a blank for each line end and control character, and for what has no
+    bytes.
+    """
+    return "".join(" " if category(letter) in _CONTROLS else letter for letter in text)
 
 
 def decode_text(data: bytes, where: str) -> str:
