@@ -126,7 +126,9 @@ def lens_from_prescription(
     check_range(prescription, dtype, where)
     name = str(prescription.get("name", where))
     try:
-        model = find_index_model(index_model or str(prescription.get("index_model", "dfc")))
+        model = find_index_model(
+            str(prescription.get("index_model", "dfc")) if index_model is None else index_model
+        )
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     rows = _rows(prescription, where)

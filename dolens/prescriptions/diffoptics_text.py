@@ -29,6 +29,8 @@ from dolens.prescriptions.diffoptics_glasses import diffoptics_material
 from dolens.prescriptions.system_data import SYSTEM_DATA_KEYS
 
 _COLUMNS = "type distance roc diameter material"
+# Far more than an asphere has coefficients.
+_MOST_COLUMNS = 1000
 _LETTERS = {"plane": "S", "sphere": "S", "conic": "S", "even_asphere": "S"}
 _LETTERS |= {"aperture": "A", "xy_polynomial": "X"}
 _HEADER_KEYS = ("source", "index_model", "stop", *SYSTEM_DATA_KEYS)
@@ -165,6 +167,8 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
         raise InputError(f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)")
     if len(words) < 5:
         raise InputError(f"{place}: a row has at least the columns '{_COLUMNS}'")
+    if len(words) > _MOST_COLUMNS:
+        raise InputError(f"{place}: has {len(words)} columns (allowed: {_MOST_COLUMNS} at most)")
     if len(words) > 5 and letter in "OAI":
         raise InputError(f"{place}: a row of type {letter} ends with its material")
     distance = number_in_text(words[1], f"{place}: 'distance'")
