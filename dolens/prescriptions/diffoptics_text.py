@@ -18,6 +18,7 @@ fields, and which surfaces are more than a bare S) stands behind a # in the seco
 """
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -97,6 +98,17 @@ def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, An
         raise InputError(f"{where}: line 2: there is no surface {next(iter(shapes))}")
     rows[str(len(rows))].pop("thickness")
     return {**prescription, "surfaces": rows, "sensor": sensor}
+
+
+def object_radius(text: str, where: str) -> float:
+    """Return the radius (mm) of the object's row, O, of a file that was read; infinite for a plane,
+    or where there is no such row.
+    """
+    for at, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if at > 2 and words[:1] == ["O"]:
+            return number_in_text(words[2], f"{where}: line {at}: 'roc'") or math.inf
+    return math.inf
 
 
 def diffoptics_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:

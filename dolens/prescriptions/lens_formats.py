@@ -10,7 +10,12 @@ from dolens.errors import InputError
 from dolens.file_text import decode_text, much_at_once, without_controls
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
-from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.curved_object import curved_object
+from dolens.prescriptions.diffoptics_text import (
+    diffoptics_text_of,
+    object_radius,
+    prescription_from_diffoptics,
+)
 from dolens.prescriptions.json_lenses import json_of, read_json
 from dolens.prescriptions.oslo.reader import read_oslo
 from dolens.prescriptions.read_file import ReadPrescription
@@ -62,7 +67,11 @@ def _is_of(text: str, signs: tuple[re.Pattern[str], ...]) -> bool:
 
 
 def _read_diffoptics(text: str, where: str) -> ReadPrescription:
-    return ReadPrescription(prescription_from_diffoptics(text, where), [])
+    prescription = prescription_from_diffoptics(text, where)
+    radius = object_radius(text, where)
+    return ReadPrescription(
+        prescription, curved_object(prescription, {"radius": radius}, f"{where}: the object")
+    )
 
 
 # In the order in which content is looked at.

@@ -66,6 +66,12 @@ def test_off_the_axis_it_is_refused(name, write):
         read_lens(write(90, 3).encode(), name)
 
 
+def test_that_of_do_s_text_is_listed():
+    rows = "O 0 -200 10 air\nS 0 20 10 1.5/60\nI 30 0 5 air\n"
+    text = f"lens\ntype distance roc diameter material\n{rows}"
+    assert any(RADIUS in entry for entry in read_lens(text.encode(), "lens.txt").passed_over)
+
+
 def test_that_of_ray_optics_is_listed():
     content = json.loads((PEERS / "ray_optics_rich.roa").read_text())
     model = content["optical_model"]["attributes"]
