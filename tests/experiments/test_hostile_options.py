@@ -6,7 +6,7 @@ Commands and options are those of the program itself: a new one is tried without
 import os
 import shutil
 from pathlib import Path
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pytest
@@ -111,6 +111,8 @@ def at_work(work, monkeypatch):
     monkeypatch.chdir(work)
     monkeypatch.setenv("COLUMNS", "400")
     monkeypatch.setattr("dolens.lens_page.write_page", lambda *_, **__: Written())
+    nothing = SimpleNamespace(name="", summary="", sections=[])
+    monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda _: nothing)
     for name in ("apply", "restore"):
         monkeypatch.setattr(PictureCamera, name, lambda *_: [])
 

@@ -52,7 +52,8 @@ def commands_of(text: str, where: str) -> list[Command]:
         if code.endswith("&"):
             held.append(code[:-1] + " ")
             continue
-        found += _commands("".join((*held, code)), begins)
+        if held or code:
+            found += _commands("".join((*held, code)), begins)
         held, length = [], 0
     return found + _commands("".join(held), begins)
 
