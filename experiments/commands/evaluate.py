@@ -1,6 +1,7 @@
 """The camera of a run again, without training: on other photographs, depths, noise."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from dolens.experiments.commands.evaluation_overrides import (
     refuse_other_work,
     with_own_calibration,
 )
+from dolens.experiments.data.camera_data import CropDataModule
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import FinishedRun, load_recorded
 from dolens.experiments.running.made_trainer import quiet_lightning
@@ -203,6 +205,9 @@ def _tested(
     trainer: lightning.Trainer = run.made(
         "trainer", settings.trainer, **own, **_one_process(settings.trainer)
     )
+    if isinstance(run.data, CropDataModule):
+        # The crops are the same by any number of processes that cut them.
+        run.data.num_workers = min(run.data.num_workers, os.cpu_count() or 1)
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))
     info["evaluated"] = dict(evaluated)

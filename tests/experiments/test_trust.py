@@ -1,5 +1,6 @@
 """A stranger's run folder is data: what it may call, import and write is known beforehand."""
 
+import os
 import pkgutil
 import sys
 from pathlib import Path
@@ -204,6 +205,15 @@ def test_a_run_of_many_processes_is_evaluated_in_one(settings, folder, monkeypat
     evaluate(folder, name="again")
     (trainer,) = made
     assert (trainer.world_size, trainer.num_nodes, trainer.strategy.launcher) == (1, 1, None)
+
+
+def test_no_more_processes_cut_crops_than_there_are_processors(folder, monkeypatch):
+    changed(folder, "data.num_workers", 1000)
+    made = []
+    monkeypatch.setattr(Trainer, "test", lambda trainer, module, data, **_: made.append(data))
+    evaluate(folder, name="again")
+    (data,) = made
+    assert data.num_workers == os.cpu_count()
 
 
 @pytest.mark.parametrize("key", ["plugins", "strategy", "accelerator", "profiler", "logger"])
