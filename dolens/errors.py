@@ -5,6 +5,7 @@ message has the same form and offers the nearest allowed name.
 """
 
 import difflib
+import re
 from collections.abc import Iterable
 
 # Letters of a message, and of a word that is worth comparing with others.
@@ -48,6 +49,19 @@ def readable(text: object) -> str:
             for letter in one_line(found)
         )
     return found
+
+
+# A number that has a comma for its point.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", re.ASCII)
+
+
+def comma_hint(value: object) -> str:
+    """Return what to say of a number with a decimal comma, such as `1,5`, or of several with
+    slashes between, such as the nd/Vd of a glass; empty for all else.
+    """
+    parts = value.split("/") if isinstance(value, str) else []
+    comma = any(_DECIMAL_COMMA.fullmatch(part.strip()) for part in parts)
+    return " (it has a decimal comma; write a point)" if comma else ""
 
 
 def check_keys(given: Iterable[object], allowed: Iterable[str], where: str) -> None:

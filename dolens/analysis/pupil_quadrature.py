@@ -21,6 +21,9 @@ from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
 
+# Rings, arms, and points along a side of a grid: more rays than memory holds are no sampling.
+_MOST_SIDE = 2000
+
 
 @dataclass(frozen=True)
 class SpotRays:
@@ -104,6 +107,8 @@ def square_grid(
     """
     if count < 1:
         raise InputError(f"count: {count}; allowed: 1 or more rays along each side")
+    if count > _MOST_SIDE:
+        raise InputError(f"count: {count}; allowed: {_MOST_SIDE} rays along each side at most")
     if half_width is not None and not 0.0 < half_width < math.inf:
         raise InputError(f"half_width: {half_width} mm; allowed: a positive number")
     axis = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
@@ -174,6 +179,8 @@ def gaussian_quadrature(
     """
     if rings < 1 or arms < 2 or arms % 2:
         raise InputError(f"rings must be at least 1 and arms even, not {rings} and {arms}")
+    if rings > _MOST_SIDE or arms > _MOST_SIDE:
+        raise InputError(f"rings and arms: {rings} and {arms}; allowed: {_MOST_SIDE} at most")
     nodes, half_shares = np.polynomial.legendre.leggauss(rings)
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))

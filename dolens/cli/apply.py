@@ -7,6 +7,8 @@ import typer
 
 from dolens.cli.extras import TRUST, import_extra
 from dolens.cli.quiet_logging import quiet_logging
+from dolens.errors import readable
+from dolens.file_text import check_written
 
 
 def apply(
@@ -95,6 +97,7 @@ def apply(
         white_level=white_level,
         megapixels=megapixels,
     )
+    check_written(out, "--out", folder=True)
     folder, camera, found = module.apply_run(run, pictures, options, checkpoint, out, trust)
     where = "whole pictures" if camera.margin is None else f"windows of {window} pixels"
     beside = "" if camera.margin is None else f" and {camera.margin} around them"
@@ -103,12 +106,13 @@ def apply(
         f"{where}{beside}"
     )
     _show(found)
-    typer.echo(folder)
+    typer.echo(readable(folder))
 
 
 def _show(found: list) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     for mapping in dict.fromkeys(entry.mapping for entry in found):
         typer.echo(mapping)
@@ -122,7 +126,7 @@ def _show(found: list) -> None:
     for entry in measured:
         numbers = entry.metrics
         table.add_row(
-            entry.name,
+            Text(readable(entry.name)),
             f"{numbers['depth_mm'] / 1000:g}",
             f"{numbers['raw_psnr_db']:.2f}",
             f"{numbers['raw_ssim']:.3f}",

@@ -11,6 +11,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from dolens.cli.extras import import_extra
+from dolens.errors import InputError
+from dolens.file_text import check_written
 
 _LONGEST_HEADING = 12
 
@@ -51,6 +53,11 @@ def compare(
     ] = None,
 ) -> None:
     """Compare runs: a row for all that differ in nothing but the seed, what differs as columns."""
+    for option, file in (("csv", csv), ("json", as_json), ("markdown", markdown)):
+        check_written(None if str(file) == "-" else file, f"--{option}")
+    check_written(figure, "--figure")
+    if figure is not None and figure.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise InputError(f"--figure: '{figure.name}'; allowed: a name in .png, .svg or .pdf")
     module = import_extra("dolens.experiments.comparison.comparison", "train", "dolens compare")
     wanted = [name.strip() for text in metrics or () for name in text.split(",") if name.strip()]
     found = module.compared(folders, wanted, against, judge)

@@ -39,7 +39,7 @@ def convert(
 
     prescription, passed_over = read_lens_file(old)
     if not force and os.path.lexists(new):
-        same = os.path.exists(new) and new.samefile(old)
+        same = os.path.exists(new) and os.path.exists(old) and new.samefile(old)
         raise InputError(
             f"{new}: {'is A itself' if same else 'exists already'}; --force overwrites it"
         )

@@ -8,6 +8,7 @@ import typer
 
 from dolens.cli.extras import TRUST, import_extra
 from dolens.cli.quiet_logging import quiet_logging
+from dolens.errors import readable
 
 _HEADLINES = {
     "psnr_db": "PSNR, dB",
@@ -55,7 +56,7 @@ def evaluate(
     _show(
         f"{found.run.experiment}, {found.run.step} steps", module.own_metrics(found), found.metrics
     )
-    typer.echo(found.folder)
+    typer.echo(readable(found.folder))
 
 
 def _show(title: str, own: Mapping[str, float], metrics: Mapping[str, float]) -> None:

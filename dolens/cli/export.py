@@ -85,10 +85,13 @@ def export(
     """
     from rich.console import Console
 
-    from dolens.errors import InputError, check_choice
+    from dolens.errors import InputError, check_choice, readable
+    from dolens.file_text import check_written, resolved_path
 
     if not 0.0 < sag_nm <= 10.0:
         raise InputError(f"--sag-nm: must be above 0 and at most 10, not {sag_nm:g}")
+    check_written(out, "--out", folder=True)
+    resolved_path(run_or_lens)
     quiet_logging()
     console = Console(highlight=False)
     is_run = Path(run_or_lens).is_dir()
@@ -116,7 +119,7 @@ def export(
                 run_or_lens, out, formats, tolerances, sag_nm, progress
             )
     _show(console, exported)
-    console.print(str(folder), markup=False)
+    console.print(readable(folder), markup=False)
     if only is not None and exported.refused:
         raise typer.Exit(1)
 

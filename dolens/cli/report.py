@@ -7,6 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from dolens.cli.extras import import_extra
+from dolens.errors import readable
+from dolens.file_text import check_written
 
 _PACKAGE = "dolens.experiments.report"
 # A paragraph a line: the terminal wraps them.
@@ -59,6 +61,7 @@ def report(
     ] = False,
 ) -> None:
     """Run the report; HELP says what it does."""
+    check_written(folder, "--folder", folder=True)
     plan_module = import_extra(f"{_PACKAGE}.plan", "train", "dolens report")
     plan = plan_module.load_plan()
     if list_systems:
@@ -172,7 +175,7 @@ def _summary(made: Any) -> bool:
         typer.echo(f"not run: {', '.join(made.missing)}")
     typer.echo(
         f"{counts[checks.State.HOLDS]} checks hold, {counts[checks.State.FAILS]} do not, "
-        f"{counts[checks.State.NOT_RUN]} were not run: {made.page}"
+        f"{counts[checks.State.NOT_RUN]} were not run: {readable(made.page)}"
     )
     return bool(counts[checks.State.FAILS] or made.failed)
 

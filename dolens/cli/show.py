@@ -75,16 +75,20 @@ def show(
     from rich.console import Console
 
     from dolens.errors import InputError
+    from dolens.file_text import check_written
     from dolens.lens_page.overview import lens_overview
     from dolens.lens_page.preparation import prepared_lens
     from dolens.optics.tables import printable
     from dolens.prescriptions import lens_from_prescription
-    from dolens.prescriptions.files import find_lens, read_lens_file
+    from dolens.prescriptions.files import find_lens, read_lens_file, read_yaml_file
 
     if tolerances is not None and html is None and figures is None:
         raise InputError("--tolerances needs --html or --figures, where its figure goes")
     if html is not None:
         _check_page(html, Path(lens), force)
+    check_written(figures, "--figures", folder=True)
+    if tolerances is not None and tolerances != "default":
+        read_yaml_file(tolerances, "file of tolerances", "--tolerances")
     fields = None if not field else [_field(text) for text in field]
     path = find_lens(lens)
     prescription, passed_over = read_lens_file(path)
@@ -132,6 +136,7 @@ def _field(text: str) -> tuple[float, float]:
 def _check_page(page: Path, lens: Path, force: bool) -> None:
     """Refuse to write a page over something else before work begins."""
     from dolens.errors import InputError
+    from dolens.file_text import check_written
     from dolens.lens_page import is_page
 
     if page.suffix.lower() not in (".html", ".htm"):
@@ -142,6 +147,7 @@ def _check_page(page: Path, lens: Path, force: bool) -> None:
         raise InputError(f"--html: '{page}' is a folder")
     if page.exists() and not force and not is_page(page):
         raise InputError(f"--html: {page} is no page of dolens; --force overwrites it")
+    check_written(page, "--html")
 
 
 def _print_table(console: "Console", table: "Table") -> None:
@@ -209,6 +215,7 @@ def _write(
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from dolens.errors import readable
     from dolens.lens_page import write_page
 
     progress = Progress(
@@ -240,8 +247,11 @@ def _write(
     if html is not None:
         size = html.stat().st_size
         console.print(
-            f"{html}: written, {written.sections} sections, {size / 1e6:.1f} MB", markup=False
+            f"{readable(html)}: written, {written.sections} sections, {size / 1e6:.1f} MB",
+            markup=False,
         )
     if figures is not None:
-        console.print(f"{figures}: {written.figures} figures, each as PNG and SVG", markup=False)
+        console.print(
+            f"{readable(figures)}: {written.figures} figures, each as PNG and SVG", markup=False
+        )
     console.print(f"in {seconds:.1f} s", style="dim", markup=False)

@@ -165,10 +165,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
 
 def _read(lens: Lens, path: Path, notes: list[str]) -> tuple[Mapping[str, Any], Any]:
     """Return the tolerances of a file and their factor; the lens gets the file's elements."""
-    try:
-        content = read_yaml_file(path, "file of tolerances")
-    except InputError as error:
-        raise InputError(f"--tolerances: {error}") from None
+    content = read_yaml_file(path, "file of tolerances", "--tolerances")
     require_mapping(content, str(path))
     elements = content.get("elements")
     if "defaults" in content:

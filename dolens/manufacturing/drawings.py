@@ -17,6 +17,7 @@ from dolens.manufacturing.element_sheet import element_sheet
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.shop_tolerances import ShopTolerances
 from dolens.optics.lens import Lens
+from dolens.optics.tables import printable
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ def drawing_figures(
             # A name is no formula, whatever signs it has.
             if isinstance(text, Text) and text.get_text() not in EQUATIONS.values():
                 text.set_parse_math(False)
+                text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
     return named, [fault for fault in faults.values() if fault is not None]
 
 

@@ -7,7 +7,8 @@ from typing import Any
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.files import load_prescription
+from dolens.prescriptions.checks import require_mapping
+from dolens.prescriptions.files import read_yaml_file
 from dolens.tolerancing.perturbations import Tolerances, tolerances_from
 
 AGREE = "to be agreed"
@@ -70,10 +71,11 @@ def read_tolerances(lens: Lens, path: str) -> tuple[Lens, ShopTolerances]:
     Raises:
         InputError: one line that names the file and the key.
     """
-    data = load_prescription(path)
+    data = read_yaml_file(path, "file of tolerances", "--tolerances")
     if not isinstance(data, Mapping):
         raise InputError(f"{path}: must map 'tolerances' to parameters and half-ranges")
     if "defaults" in data:  # an experiment's file, whose other keys are the experiment's
+        require_mapping(data.get("lens") or {}, f"{path}: lens")
         elements = (data.get("lens") or {}).get("elements")
     else:
         check_keys(data, _FILE_KEYS, str(path))
@@ -82,6 +84,7 @@ def read_tolerances(lens: Lens, path: str) -> tuple[Lens, ShopTolerances]:
         rows = {**prescription_of(lens), "elements": elements}
         lens = lens_from_prescription(rows, lens.dtype, where=str(path))
     shop = data.get("drawing") or {}
+    require_mapping(shop, f"{path}: drawing")
     check_keys(shop, SHOP_KEYS, f"{path}: drawing")
     labels = {}
     if data.get("tolerances"):

@@ -11,6 +11,7 @@ from dolens.manufacturing.sag_errors import SagError, sag_errors
 from dolens.manufacturing.solids import element_solid
 from dolens.manufacturing.step_file import read_step_file, write_step_file
 from dolens.optics.lens import Lens
+from dolens.optics.tables import printable
 
 # Largest error in sag (nm) that a file may have.
 TOLERANCE_NM = 10.0
@@ -67,7 +68,7 @@ def export_step(lens: Lens, path: str | Path, tolerance_nm: float = TOLERANCE_NM
             left_out.append(fault)
     if not elements:
         raise InputError(f"STEP: no element of lens '{lens.name}' is a solid: {left_out[0]}")
-    write_step_file(solids, lens.name or "lens", path)
+    write_step_file(solids, printable(lens.name or "lens"), path)
     read = read_step_file(path)
     errors, volumes, by_name = [], {}, {}
     for element in elements:
@@ -87,4 +88,4 @@ def export_step(lens: Lens, path: str | Path, tolerance_nm: float = TOLERANCE_NM
 
 def product_name(element: GlassElement) -> str:
     """Return the name of an element's product in a STEP file: element, surfaces, glass."""
-    return f"{element.title} {element.material.name}"
+    return printable(f"{element.title} {element.material.name}")

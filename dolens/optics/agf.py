@@ -21,7 +21,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from dolens.errors import InputError
+from dolens.errors import InputError, comma_hint
 from dolens.optics.agf_formulas import Dispersion, agf_dispersion
 from dolens.optics.thermal import ThermalCoefficients
 
@@ -248,6 +248,7 @@ def _number(word: str, entry: AgfEntry, keyword: str, optional: bool) -> float:
         value = math.nan
     if math.isfinite(value) and "_" not in word:
         return value
-    if optional or word in _MISSING:
+    comma = comma_hint(word)
+    if not comma and (optional or word in _MISSING):
         return math.nan if optional else 0.0
-    raise InputError(f"{entry.place}: line {keyword}: '{word}' must be a finite number")
+    raise InputError(f"{entry.place}: line {keyword}: '{word}' must be a finite number{comma}")

@@ -39,11 +39,15 @@ def agf_dispersion(number: int, coefficients: Sequence[float]) -> Dispersion:
         coefficients: in the catalogue's order, for µm; those left out are 0.
 
     Raises:
-        InputError: there is no such formula.
+        InputError: there is no such formula, or one with fewer coefficients.
     """
     if number not in _FORMULAS:
         raise InputError(f"dispersion formula {number} is unknown (allowed: 1 to 13)")
     count, make = _FORMULAS[number]
+    if any(coefficients[count:]):
+        raise InputError(
+            f"dispersion formula {number} has {count} coefficients, and more are given"
+        )
     padded = [float(value) for value in coefficients[:count]]
     return make(padded + [0.0] * (count - len(padded)))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, comma_hint
 from dolens.optics.dispersion import require_wavelength
 from dolens.optics.glass import Glass
 from dolens.optics.glass_catalog import find_glass
@@ -123,6 +123,8 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
     if name.lower() == MIRROR.name:
         return MIRROR
     match = _GLASS.fullmatch(name)
+    if comma_hint(name):
+        raise InputError(f"material '{name}' must have numbers{comma_hint(name)}")
     if match is None:
         return find_glass(name, model.air, environment)
     nd, vd = float(match[1]), float(match[2])

@@ -255,7 +255,14 @@ class DampedLeastSquares(torch.optim.Optimizer):
         if isinstance(found, Tensor):
             if not found.numel():
                 raise InputError("least squares: there are no residuals")
+            if found.is_complex():
+                raise InputError("least squares: the residuals are complex; give their parts")
             return TensorResiduals(found, self._variables)
+        if not isinstance(found, Residuals):
+            raise InputError(
+                f"least squares: the closure returns {type(found).__name__}; allowed: a tensor of "
+                "residuals, or an object as dolens.optimize.residuals.Residuals"
+            )
         return found
 
     def _weights(self, model: LinearModel) -> Tensor:

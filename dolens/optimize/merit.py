@@ -146,7 +146,8 @@ class MeritValue:
         """Return the merit; `inf` where rays fail or a chief ray cannot be found."""
         if self.operands is None:
             return math.inf
-        total: float = sum((item.weight * item.deviation) ** 2 for item in self.operands)
+        weighted = [item.weight * item.deviation for item in self.operands]
+        total: float = sum(one * one for one in weighted)  # infinite where a power would raise
         if self.quality is not None and self._merit.quality is not None:
             if not self._merit.quality.is_usable(self.quality):
                 return math.inf

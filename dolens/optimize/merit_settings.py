@@ -86,6 +86,7 @@ class MeritSettings:
     state_weights: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        check_types(MeritSettings, vars(self), "merit")
         check_choice(self.sampling, SAMPLINGS, "merit.sampling")
         if self.quality is not None and not callable(self.quality):
             check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")

@@ -6,6 +6,7 @@ A target t contributes (weight·(v - t))² to the merit function, a limit only t
 beyond it.  Its derivatives come from autograd: these are a few numbers, each one reverse sweep.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
@@ -142,6 +143,10 @@ class Operand:
             raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
         if self.min is not None and self.max is not None and self.min > self.max:
             raise InputError(f"{where}: min exceeds max")
+        for key in ("target", "min", "max"):
+            value = getattr(self, key)
+            if value is not None and (math.isnan(value) or (key == "target" and math.isinf(value))):
+                raise InputError(f"{where}: {key} must be a number, not {value}")
         if not 0.0 < self.weight <= MOST_WEIGHT:
             raise InputError(
                 f"{where}: weight must be positive, to {MOST_WEIGHT:g}, not {self.weight:g}"
@@ -186,9 +191,10 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         for key in ("target", "min", "max")
     )
     weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
-    field = [_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0)]
-    if len(field) != 2:
-        raise InputError(f"operand '{kind}': field is x and y, not {field}")
+    given = settings.get("field") or (0.0, 0.0)
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
+        raise InputError(f"operand '{kind}': field is x and y, not {given!r}")
+    field = [_number(v, f"{kind}: field") for v in given]
     gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)

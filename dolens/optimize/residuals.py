@@ -62,6 +62,8 @@ class TensorResiduals:
         """
         if not self._residuals.requires_grad:
             raise InputError("the closure's residuals have no gradient with respect to anything")
+        if not all(variable.requires_grad for variable in self._variables):
+            raise InputError("least squares: a variable has no gradient (requires_grad is False)")
         return LinearModel.of_rows(self._residuals, self._jacobian())
 
     def _jacobian(self) -> Tensor:

@@ -12,6 +12,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_file_units, unit_factors, unit_of
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.dependents import Dependent, dependent, of_each_state
+from dolens.typed_values import check_type
 
 _KEYS = ("scale", "initial", "lower", "upper")
 
@@ -64,6 +65,7 @@ class DesignVariables(nn.Module):
         others: Mapping[str, Tensor] | None = None,
     ) -> None:
         super().__init__()
+        check_type(variables, Mapping[str, Mapping[str, Any] | None], "variables")
         self.names: list[str] = []
         # In a tuple, so that the lens's parameters are not this module's too.
         self._of = (lens,)

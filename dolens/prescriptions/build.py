@@ -61,7 +61,13 @@ from dolens.prescriptions.deflections import (
     with_power,
 )
 from dolens.prescriptions.field_data import set_object_fields
-from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
+from dolens.prescriptions.media import (
+    EXPANSION_KEY,
+    catalogue_expansion,
+    environment_of,
+    expansion_of,
+    medium_of,
+)
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.sensor_data import sensor_from, sensor_row
@@ -120,7 +126,9 @@ def lens_from_prescription(
     check_range(prescription, dtype, where)
     name = str(prescription.get("name", where))
     try:
-        model = find_index_model(index_model or str(prescription.get("index_model", "dfc")))
+        model = find_index_model(
+            str(prescription.get("index_model", "dfc")) if index_model is None else index_model
+        )
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     rows = _rows(prescription, where)
@@ -140,7 +148,7 @@ def lens_from_prescription(
         else:
             surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
             materials.append(medium_of(row.get("material"), model, place, air))
-        expansions.append(expansion_of(row, place))
+        expansions.append(expansion_of(row, materials[-1], place))
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -214,8 +222,9 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
         row |= aperture_rows(surface.aperture)
         row |= _gap(lens, number)
         row["material"] = material.name
-        if lens.thermal_expansions[int(number) - 1] is not None:
-            row[EXPANSION_KEY] = lens.thermal_expansions[int(number) - 1]
+        expansion = lens.thermal_expansions[int(number) - 1]
+        if expansion is not None and catalogue_expansion(material) is None:
+            row[EXPANSION_KEY] = expansion
         rows[number] = row
     return {
         "name": lens.name,

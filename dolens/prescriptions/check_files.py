@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dolens.errors import InputError, one_line
+from dolens.file_text import resolved_path
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.files import SUFFIXES, read_lens_file
 
@@ -57,13 +58,16 @@ def lens_files(folder: str | Path, suffixes: Sequence[str] = ()) -> list[Path]:
         InputError: there is no such folder, or a suffix is of no format.
     """
     folder = Path(folder)
+    resolved_path(folder)
     if folder.is_file():
         return [folder]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such file or folder")
     wanted = {s.lower() if s.startswith(".") else f".{s.lower()}" for s in suffixes}
     for suffix in wanted - set(SUFFIXES):
-        raise InputError(f"no lens file ends in {suffix} (allowed: {', '.join(SUFFIXES)})")
+        raise InputError(
+            f"--format: no lens file ends in {suffix} (allowed: {', '.join(SUFFIXES)})"
+        )
     return sorted(
         Path(at) / name
         for at, _, names in os.walk(folder)

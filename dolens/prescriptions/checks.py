@@ -6,8 +6,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
-from dolens.prescriptions.decimals import comma_hint
+from dolens.errors import InputError, comma_hint
 
 
 def as_number(value: object, what: str, finite: bool = True) -> float:

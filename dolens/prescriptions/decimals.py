@@ -1,24 +1,16 @@
 """Decimal text and double precision are converted to each other without losing a bit."""
 
 import math
-import re
 from decimal import Context, Decimal
 from fractions import Fraction
 
-from dolens.errors import InputError
+from dolens.errors import InputError, comma_hint
 
 # Any radius with more digits than this was written for its curvature's sake.
 _DIGITS_OF_A_DOUBLE = 17
 _RECIPROCAL = Context(prec=40)
 # Longer text is no number that a program writes, and is slow to read.
 _LONGEST = 400
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", re.ASCII)
-
-
-def comma_hint(value: object) -> str:
-    """Return what to say of a number with a decimal comma, such as `1,5`; empty for all else."""
-    comma = isinstance(value, str) and _DECIMAL_COMMA.fullmatch(value.strip())
-    return " (it has a decimal comma; write a point)" if comma else ""
 
 
 def number_in_text(text: str, place: str) -> float:

@@ -1,11 +1,14 @@
 """Lens files of DeepLens are JSON: a list of surfaces with positions, radii and media.
 
 `roc` is a radius of curvature (0 is a plane), `c` a curvature, `d_next` the gap behind, `mat2` the
-medium behind, `r` the semi-diameter.  `ai` lists the coefficients of r², r⁴, ....  The stop is the
-surface of type Aperture or Stop.
+medium behind, `r` the semi-diameter, of a square half its diagonal.  `ai` lists the coefficients of
+r⁴, r⁶, ...; the first is that of r² unless `use_ai2` is false.  A surface is decentred by `pos_xy`
+(mm), and its axis points along `vec_local`.  The stop is the surface with `is_aperture`, else the
+one of type Aperture or Stop.  Wavelengths are in µm, and an object at -20 m stands for infinity.
 """
 
 import math
+from operator import mul
 from typing import Any
 
 from dolens.errors import InputError
@@ -32,6 +35,7 @@ _POSITIONS = 1e-3
 # Focal lengths that are noted are rounded, and of other wavelengths.
 _FOCAL_LENGTHS = 0.05
 _D_LINE = 587.5618
+_FAR = -20000.0
 
 
 def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
@@ -47,12 +51,17 @@ def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
     entries = rows(content.get("surfaces"), f"{where}: 'surfaces'")
     first = mapping(entries[0] if entries else None, f"{where}: surface 1")
     stops, before, end = [], "air", number(first, "d", where, 0.0)
+    poses: dict[str, dict[str, Any]] = {}
+    marked = any(isinstance(entry, dict) and entry.get("is_aperture") for entry in entries)
     for n, entry in enumerate(entries, 1):
         place = f"{where}: surface {n}"
         surface = mapping(entry, place)
         row = _row(surface, before, place)
-        if surface.get("type") in _STOPS:
+        if surface.get("is_aperture") if marked else surface.get("type") in _STOPS:
             stops.append(n)
+        pose = _pose(surface, place)
+        if pose:
+            poses[str(n)] = {"surfaces": [n, n], **pose}
         before = row["material"]
         gap = number(surface, "d_next", place)
         end += gap if n < len(entries) else 0.0
@@ -60,13 +69,40 @@ def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
     if len(stops) > 1:
         raise InputError(f"{where}: surfaces {stops[0]} and {stops[1]} are both the stop")
     if not stops:
-        raise InputError(f"{where}: no surface is the stop (type Aperture)")
-    prescription: dict[str, Any] = {"index_model": "dfc", "stop": stops[0], "surfaces": found}
+        raise InputError(f"{where}: no surface is the stop (type Aperture, or 'is_aperture')")
+    prescription: dict[str, Any] = {"index_model": "dfc", "stop": stops[0]}
+    prescription |= _system(content, where) | {"surfaces": found}
+    if poses:
+        prescription["elements"] = poses
     if content.get("info"):
         prescription = {"name": str(content["info"]), **prescription}
     prescription["sensor"] = _sensor(content, mapping(entries[-1], where), end, where)
     _require_focal_length(content, found, where)
     return ReadPrescription(prescription, [])
+
+
+def _system(content: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the wavelengths in nm, the primary one as reference, and the object's distance.
+
+    A primary wavelength that is none of the three has no weight in what is polychromatic.
+    """
+    found: dict[str, Any] = {}
+    colours = rows(content.get("wvln_rgb", []), f"{where}: 'wvln_rgb'")
+    waves = [_nanometres(colour, f"{where}: 'wvln_rgb'") for colour in colours]
+    if content.get("primary_wvln") is not None:
+        primary = _nanometres(content["primary_wvln"], f"{where}: 'primary_wvln'")
+        if waves and primary not in waves:
+            found["wavelength_weights"] = [*(1.0 for _ in waves), 0.0]
+        waves = waves if primary in waves else [*waves, primary]
+        found["reference_wavelength"] = primary
+    if waves:
+        found["wavelengths"] = waves
+    depth = number(content, "obj_depth", where, _FAR)
+    return found if depth == _FAR else {**found, "object_distance": -depth}
+
+
+def _nanometres(value: object, place: str) -> float:
+    return round(1e3 * as_number(value, place), 9)
 
 
 def _require_focal_length(
@@ -130,7 +166,8 @@ def _aperture(surface: dict[str, Any], place: str) -> dict[str, Any]:
         half = number(surface, "l", place) / 2.0
         return {"aperture": {"half_width_x": half, "half_width_y": half}}
     if surface.get("is_square"):
-        raise InputError(f"{place}: a square aperture without its side ('l') is not held")
+        half = number(surface, "r", place) / math.sqrt(2.0)
+        return {"aperture": {"half_width_x": half, "half_width_y": half}}
     if surface.get("r") is None and surface.get("l") is not None:
         return {"semi_diameter": number(surface, "l", place) / 2.0}
     return {"semi_diameter": number(surface, "r", place)}
@@ -145,11 +182,43 @@ def _curvature(surface: dict[str, Any], place: str) -> dict[str, float]:
     return {"curvature": curvature} if exact is None else {"radius": exact}
 
 
+def _pose(surface: dict[str, Any], place: str) -> dict[str, float]:
+    """Return decenters (mm) and tilts (degrees) of a surface; nothing where it is on the axis.
+
+    The shortest turn from z to the axis (a, b, c) takes x to (1 - a²/(1 + c), -ab/(1 + c), -a).
+    """
+    found = dict(
+        zip(("decenter_x", "decenter_y"), _vector(surface, "pos_xy", 2, place), strict=True)
+    )
+    axis = _vector(surface, "vec_local", 3, place) if "vec_local" in surface else [0.0, 0.0, 1.0]
+    length = math.hypot(*axis)
+    if length == 0.0 or axis[2] <= 0.0:
+        raise InputError(f"{place}: 'vec_local' must point towards +z, not {axis}")
+    a, b, c = (part / length for part in axis)
+    tilt_x, tilt_y = math.atan2(-b, c), math.asin(a)
+    across = (1.0 - a * a / (1.0 + c), -a * b / (1.0 + c), -a)
+    turned_y = (0.0, math.cos(tilt_x), math.sin(tilt_x))
+    turned_x = (math.cos(tilt_y), -turned_y[2] * -a, -turned_y[1] * a)
+    tilt_z = math.atan2(*(sum(map(mul, across, side)) for side in (turned_y, turned_x)))
+    angles = zip(("tilt_x", "tilt_y", "tilt_z"), (tilt_x, tilt_y, tilt_z), strict=True)
+    found |= {name: math.degrees(angle) for name, angle in angles}
+    return {name: value for name, value in found.items() if value}
+
+
+def _vector(surface: dict[str, Any], key: str, count: int, place: str) -> list[float]:
+    """Return a list of so many numbers, zeros where there is none."""
+    values = rows(surface.get(key, [0.0] * count), f"{place}: '{key}'")
+    if len(values) != count:
+        raise InputError(f"{place}: '{key}' must be a list of {count} numbers")
+    return [as_number(value, f"{place}: '{key}'") for value in values]
+
+
 def _coefficients(surface: dict[str, Any], place: str) -> dict[str, float]:
     """Return a2 (where it is not zero), a4, ... of the list `ai`."""
     values = rows(surface.get("ai", []), f"{place}: 'ai'")
     numbers = [as_number(value, f"{place}: 'ai'") for value in values]
-    found = {f"a{2 * i}": value for i, value in enumerate(numbers, 1)}
+    first = 1 if surface.get("use_ai2", True) else 2
+    found = {f"a{2 * i}": value for i, value in enumerate(numbers, first)}
     if not found.get("a2"):
         found.pop("a2", None)
     return found
@@ -170,4 +239,6 @@ def _sensor(
     sensor = {"distance": gap}
     if content.get("r_sensor") is not None:
         sensor["diameter"] = 2.0 * number(content, "r_sensor", where)
+    elif content.get("sensor_size") is not None:
+        sensor["diameter"] = math.hypot(*_vector(content, "sensor_size", 2, where))
     return sensor

@@ -2,7 +2,7 @@
 
 import re
 
-from dolens.errors import InputError, did_you_mean
+from dolens.errors import InputError, comma_hint, did_you_mean
 
 # nd/Vd as diffoptics tabulates them (its index model counts them from 589.3 nm).
 DIFFOPTICS_GLASSES = {
@@ -57,5 +57,6 @@ def diffoptics_material(name: str, place: str) -> str:
         raise InputError(
             f"{place}: material '{name}' is unknown{did_you_mean(word, known)} (allowed: nd/Vd, "
             "such as 1.5168/64.17, air, occluder, vacuum, or a glass in diffoptics's own table)"
+            f"{comma_hint(name)}"
         )
     return known.get(word, word)

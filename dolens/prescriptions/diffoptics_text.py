@@ -18,6 +18,7 @@ fields, and which surfaces are more than a bare S) stands behind a # in the seco
 """
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,6 +30,8 @@ from dolens.prescriptions.diffoptics_glasses import diffoptics_material
 from dolens.prescriptions.system_data import SYSTEM_DATA_KEYS
 
 _COLUMNS = "type distance roc diameter material"
+# Far more than an asphere has coefficients.
+_MOST_COLUMNS = 1000
 _LETTERS = {"plane": "S", "sphere": "S", "conic": "S", "even_asphere": "S"}
 _LETTERS |= {"aperture": "A", "xy_polynomial": "X"}
 _HEADER_KEYS = ("source", "index_model", "stop", *SYSTEM_DATA_KEYS)
@@ -95,6 +98,17 @@ def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, An
         raise InputError(f"{where}: line 2: there is no surface {next(iter(shapes))}")
     rows[str(len(rows))].pop("thickness")
     return {**prescription, "surfaces": rows, "sensor": sensor}
+
+
+def object_radius(text: str, where: str) -> float:
+    """Return the radius (mm) of the object's row, O, of a file that was read; infinite for a plane,
+    or where there is no such row.
+    """
+    for at, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if at > 2 and words[:1] == ["O"]:
+            return number_in_text(words[2], f"{where}: line {at}: 'roc'") or math.inf
+    return math.inf
 
 
 def diffoptics_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
@@ -165,6 +179,8 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
         raise InputError(f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)")
     if len(words) < 5:
         raise InputError(f"{place}: a row has at least the columns '{_COLUMNS}'")
+    if len(words) > _MOST_COLUMNS:
+        raise InputError(f"{place}: has {len(words)} columns (allowed: {_MOST_COLUMNS} at most)")
     if len(words) > 5 and letter in "OAI":
         raise InputError(f"{place}: a row of type {letter} ends with its material")
     distance = number_in_text(words[1], f"{place}: 'distance'")

@@ -122,21 +122,23 @@ def decode_prescription(data: bytes, path: str | Path) -> Any:
     return read_lens(data, path).prescription
 
 
-def read_yaml_file(path: str | Path, what: str) -> Any:
+def read_yaml_file(path: str | Path, what: str, option: str = "") -> Any:
     """Read a YAML file as plain values; nothing in it names code, and no key may be given twice.
 
     Args:
         path: the file.
         what: what it is to be, for messages.
+        option: of the command line that names it; messages begin with it.
 
     Raises:
         InputError: it cannot be read, or is not valid YAML; the message is one line.
     """
     try:
-        text = read_file(path, MOST_BYTES, what).decode("utf-8")
+        return plain_values(read_file(path, MOST_BYTES, what).decode("utf-8"), str(path))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not valid YAML ({error})") from None
-    return plain_values(text, str(path))
+    except InputError as error:
+        raise InputError(f"{option}: {error}" if option else error) from None
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:

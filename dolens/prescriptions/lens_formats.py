@@ -7,10 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text
+from dolens.file_text import decode_text, much_at_once, without_controls
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
-from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.curved_object import curved_object
+from dolens.prescriptions.diffoptics_text import (
+    diffoptics_text_of,
+    object_radius,
+    prescription_from_diffoptics,
+)
 from dolens.prescriptions.json_lenses import json_of, read_json
 from dolens.prescriptions.oslo.reader import read_oslo
 from dolens.prescriptions.read_file import ReadPrescription
@@ -62,7 +67,11 @@ def _is_of(text: str, signs: tuple[re.Pattern[str], ...]) -> bool:
 
 
 def _read_diffoptics(text: str, where: str) -> ReadPrescription:
-    return ReadPrescription(prescription_from_diffoptics(text, where), [])
+    prescription = prescription_from_diffoptics(text, where)
+    radius = object_radius(text, where)
+    return ReadPrescription(
+        prescription, curved_object(prescription, {"radius": radius}, f"{where}: the object")
+    )
 
 
 # In the order in which content is looked at.
@@ -140,7 +149,8 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
         )
     if chosen.name == "dO text":
         text = _utf_8(data, where, "text")
-    return chosen.read(text, where)
+    with much_at_once():
+        return chosen.read(text, where)
 
 
 def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
@@ -156,11 +166,28 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
         if suffix in (".step", ".stp"):
             why = "solids are written by 'dolens export LENS --only step'"
         raise InputError(f"{path}: {why}; lens files are written as {', '.join(WRITTEN_SUFFIXES)}")
+    if chosen.name not in ("dolens YAML", "JSON"):
+        _require_plain_lines(prescription, str(path))
     try:
         return chosen.write(prescription, str(path))
     except UnicodeEncodeError as error:
         half = error.object[error.start : error.end]
         raise InputError(f"{path}: no text file holds half of a surrogate pair, {half}") from None
+
+
+def _require_plain_lines(node: object, where: str, key: str = "") -> None:
+    """Refuse texts that would be other lines of a file of lines, or that a terminal would obey."""
+    if isinstance(node, Mapping):
+        for name, entry in node.items():
+            place = f"{where}: surface {name}" if key == "surfaces" else where
+            _require_plain_lines(entry, place, str(name))
+    elif isinstance(node, str):
+        for line in node.splitlines() if key == "source" else (node,):
+            if line != without_controls(line):
+                raise InputError(
+                    f"{where}: '{key}' has control characters, which such a file does not hold: "
+                    f"{line!r}"
+                )
 
 
 def _utf_8(data: bytes, where: str, kind: str) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.glass import Glass
 from dolens.optics.materials import IndexModel, Medium, index_model, parse_material
 from dolens.optics.thermal import Environment
 from dolens.prescriptions.checks import as_number
@@ -43,10 +44,27 @@ def medium_of(value: object, model: IndexModel, place: str, air: Environment | N
         raise InputError(f"{place}: {error}") from None
 
 
-def expansion_of(row: Mapping[str, Any], place: str) -> float | None:
-    """Return the thermal expansion (1e-6/K) that a row gives, or None."""
+def expansion_of(row: Mapping[str, Any], medium: Medium, place: str) -> float | None:
+    """Return the thermal expansion (1e-6/K) that a row gives, or None.
+
+    Raises:
+        InputError: it is no number, or the medium behind the surface has one in its catalogue.
+    """
     rate = row.get(EXPANSION_KEY)
-    return None if rate is None else as_number(rate, f"{place}: '{EXPANSION_KEY}'")
+    if rate is None:
+        return None
+    own = catalogue_expansion(medium)
+    if own is not None:
+        raise InputError(
+            f"{place}: '{EXPANSION_KEY}' is that of a mount, or of glass whose catalogue does not "
+            f"say; {medium.name} has {1e6 * own:g} there"
+        )
+    return as_number(rate, f"{place}: '{EXPANSION_KEY}'")
+
+
+def catalogue_expansion(medium: Medium) -> float | None:
+    """Return the thermal expansion (1/K) that a medium's catalogue gives, or None."""
+    return medium.expansion if isinstance(medium, Glass) else None
 
 
 def canonical(material: str) -> str:

@@ -13,6 +13,7 @@ from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.json_values import difference, mapping, number, require_unset, rows
 from dolens.prescriptions.optiland_apertures import aperture_row
@@ -56,10 +57,6 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
     positions = [_position(surface, f"{where}: surface {n}") for n, surface in enumerate(surfaces)]
     for end, what in ((surfaces[0], "object"), (surfaces[-1], "image")):
         _require_plain_end(end, f"{where}: the {what}")
-    if math.isfinite(positions[0]):
-        far = mapping(surfaces[0].get("geometry"), f"{where}: the object: 'geometry'")
-        if _shape(far, f"{where}: the object")["type"] != "plane":
-            raise InputError(f"{where}: the object: a curved object is not held")
     prescription["object_material"] = _medium(surfaces[0], f"{where}: surface 0")
     if math.isfinite(positions[0]) and abs(positions[0]) < _INFINITE:
         gap = difference(positions[1], positions[0], where)
@@ -81,7 +78,9 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
         found[str(n)] = row
     prescription["surfaces"] = found
     prescription["sensor"] = {"distance": gap} | _image(surfaces[-1], f"{where}: the image")
-    return ReadPrescription(prescription, [])
+    place = f"{where}: the object"
+    shape = _shape(mapping(surfaces[0].get("geometry"), f"{place}: 'geometry'"), place)
+    return ReadPrescription(prescription, curved_object(prescription, shape, place))
 
 
 def _require_plain_end(surface: dict[str, Any], place: str) -> None:
@@ -139,6 +138,8 @@ def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
     kind = geometry.get("type")
     radius = as_number(geometry.get("radius", math.inf), f"{place}: 'radius'", finite=False)
     if kind == "Plane":
+        if math.isfinite(radius):
+            raise InputError(f"{place}: a Plane has no radius, not {radius:g}")
         return {"type": "plane"}
     conic = number(geometry, "conic", place, 0.0)
     if kind == "StandardGeometry":

@@ -11,6 +11,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.decimals import radius_of
 from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.json_values import mapping, number, require_unset, rows
@@ -53,9 +54,7 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
     finite = abs(lengths[0]) < _INFINITE
     prescription |= _specification(model, finite, where)
     prescription["object_material"] = media[0]
-    target = _object(interfaces[0], f"{where}: the object")
-    if finite and _shape(target, profiles, f"{where}: the object")["type"] != "plane":
-        raise InputError(f"{where}: the object: a curved object is not held")
+    target = _shape(_object(interfaces[0], where), profiles, f"{where}: the object")
     if finite:
         prescription["object_distance"] = lengths[0]
     stop = sequence.get("stop_surface")
@@ -78,7 +77,8 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
     prescription["sensor"] |= {
         key: shape[key] for key in ("radius", "curvature", "conic") if key in shape
     }
-    return ReadPrescription(prescription, [])
+    place = f"{where}: the object"
+    return ReadPrescription(prescription, curved_object(prescription, target, place))
 
 
 def _row(

@@ -6,6 +6,7 @@ from pathlib import PurePath
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.file_text import without_controls
 from dolens.optics.materials import NO_GLASS, Medium, abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.codev.glass import glass_word
@@ -150,9 +151,9 @@ def _without_states(prescription: Prescription, new: str) -> list[str]:
 
 
 def _one_line_name(prescription: Prescription, new: str) -> list[str]:
-    """Put a name on one line."""
+    """Put a name on one line, without control characters."""
     name = str(prescription.get("name") or "")
-    line = " ".join(name.split())
+    line = " ".join(without_controls(name).split())
     if line == name:
         return []
     prescription["name"] = line

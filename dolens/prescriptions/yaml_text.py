@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from dolens.errors import InputError, one_line
+from dolens.file_text import much_at_once
 from dolens.prescriptions.read_file import ReadPrescription
 
 # Far more than a lens has; aliases (*name) let a short file mean billions of values.
@@ -62,6 +63,10 @@ def _construct_number(loader: _PlainLoader, node: yaml.ScalarNode) -> int | floa
         reason = f"a number of {len(text)} letters"
     else:
         try:
+            return kind(text)
+        except ValueError:
+            pass
+        try:
             return kind(_POINTED.sub(r"\1\2", text))
         except ValueError:
             reason = f"'{text}' is no number"
@@ -114,9 +119,10 @@ def plain_values(text: str, where: str) -> Any:
         InputError: it is not valid YAML; the message is one line.
     """
     try:
-        _require_modest(text)
-        # A subclass of the safe loader: it builds plain values only.
-        return yaml.load(text, Loader=_PlainLoader)
+        with much_at_once():
+            _require_modest(text)
+            # A subclass of the safe loader: it builds plain values only.
+            return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{where}: is not valid YAML ({one_line(error)})") from None
 
@@ -144,7 +150,10 @@ def _values_in(node: yaml.Node, known: dict[int, int]) -> int:
     if id(node) not in known:
         known[id(node)] = _MOST_VALUES + 1  # until it is counted, for a node that holds itself
         entries = node.value if isinstance(node, yaml.SequenceNode) else chain(*node.value)
-        known[id(node)] = 1 + sum(_values_in(entry, known) for entry in entries)
+        known[id(node)] = 1 + sum(
+            1 if isinstance(entry, yaml.ScalarNode) else _values_in(entry, known)
+            for entry in entries
+        )
     return known[id(node)]
 
 

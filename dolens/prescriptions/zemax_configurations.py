@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from dolens.errors import InputError
+from dolens.errors import InputError, comma_hint
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.states import MOST_STATES
@@ -67,7 +67,7 @@ def read_configurations(
         where: name in messages.
 
     Raises:
-        InputError: MNUM has no whole number.
+        InputError: MNUM has no whole number, or a number has a decimal comma.
     """
     begin = file.system.get("MNUM")
     if not begin or not begin[-1].arguments:
@@ -78,6 +78,11 @@ def read_configurations(
     if count != int(count) or current != int(current):
         raise InputError(f"{place} must have whole numbers, not '{begin[-1].text}'")
     count, current = int(count), int(current) or 1
+    for line in configuration_lines(file):
+        for word in line.arguments[:3]:
+            if comma_hint(word):
+                what = f"{where}: line {line.at}: {line.operand}"
+                raise InputError(f"{what} must have numbers, not '{word}'{comma_hint(word)}")
     differ = _differing(file)
     if count < 2 or not differ:
         return {}, []

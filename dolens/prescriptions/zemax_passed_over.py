@@ -1,10 +1,12 @@
 """Operands of a Zemax `.zmx` file that no lens needs are listed in words."""
 
 from collections.abc import Callable
+from itertools import zip_longest
 
 from dolens.errors import InputError
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.zemax import Line, ZemaxFile
+from dolens.prescriptions.zemax_further_numbers import further_numbers
 from dolens.prescriptions.zemax_standard import JONES_MATRIX
 
 # Operands that a surface's block may hold, and what they are about.  They bend no ray.
@@ -46,16 +48,31 @@ def _first_number(line: Line) -> bool:
     return bool(line.arguments) and _number(line.arguments[0]) != 0.0
 
 
+def _any_number(line: Line) -> bool:
+    return any(_number(word) for word in line.arguments)
+
+
+# What stands there in every file: no physical optics, and light that is not polarized.
+_USUAL_POPS = (*(0.0,) * 8, *(1.0,) * 4)
+_USUAL_POLS = (1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
+
+
+def _differs(line: Line, usual: tuple[float, ...]) -> bool:
+    """Return whether numbers are not the usual ones, and zeros behind these."""
+    found = [_number(word) for word in line.arguments]
+    return any(a != b for a, b in zip_longest(found, usual[: len(found)], fillvalue=0.0))
+
+
 # Lines that are always there, and which of them say anything.
 _SAYS: dict[str, Callable[[Line], bool]] = {
-    "GFAC": _first_number,
+    "GFAC": _any_number,
     "COAT": lambda line: bool(line.text),
     "SCAT": lambda line: bool(line.text),
     "FIMP": lambda line: bool(line.text),
-    "POPS": _first_number,
-    "POLS": lambda line: False,
-    "RAIM": lambda line: len(line.arguments) > 1 and _number(line.arguments[1]) != 0.0,
-    "PUSH": lambda line: any(_number(word) for word in line.arguments),
+    "POPS": lambda line: _differs(line, _USUAL_POPS),
+    "POLS": lambda line: _differs(line, _USUAL_POLS),
+    "RAIM": lambda line: any(map(_number, line.arguments[:2])),
+    "PUSH": _any_number,
     "SCOL": _first_number,
 }
 # Said of every file, and of no lens.
@@ -75,6 +92,8 @@ def passed_over(file: ZemaxFile) -> list[str]:
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):
             groups.setdefault(group, {})[operand] = None
+    for group, operand in further_numbers(file):
+        groups.setdefault(group, {})[operand] = None
     for number, block in enumerate(file.surfaces):
         if any(line.arguments[:1] == [JONES_MATRIX.type] for line in block.get("TYPE", [])):
             groups.setdefault(f"polarization: the Jones matrix of surface {number}", {})

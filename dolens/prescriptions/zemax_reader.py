@@ -28,6 +28,7 @@ from dolens.optics.mirrors import MIRROR
 from dolens.optics.surfaces.coordinate_break import BREAK as BREAK_KEYS
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.breaks import KIND as BREAK
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
@@ -35,7 +36,6 @@ from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_configurations import read_configurations
-from dolens.prescriptions.zemax_fields import is_axial
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_own_air import refuse_own_air
 from dolens.prescriptions.zemax_own_axes import own_axes
@@ -78,7 +78,8 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     states, lost = read_configurations(file, found, read, where)
     if states:
         found[STATES_KEY] = states
-    return ReadPrescription(found, [*passed_over(file), *lost])
+    curved = _curved_object(file, found, factor_to_mm(file, where), where)
+    return ReadPrescription(found, [*passed_over(file), *curved, *lost])
 
 
 def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
@@ -86,6 +87,7 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
     factor = factor_to_mm(file, where)
     medium, distance = _object(file, glass, factor, where)
     prescription = read_system(file, factor, distance is not None, where)
+    _curved_object(file, {**prescription, "object_distance": distance}, factor, where)
     refuse_own_air(file, where)
     prescription["stop"] = 1
     prescription["object_material"] = medium
@@ -267,11 +269,8 @@ def _object(
     """Return the medium before surface 1, and the object's distance, None for infinity."""
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
-    # On the axis a curved object is where a plane is.
     if block.type != "STANDARD":
         raise InputError(f"{place}: must be a plane of TYPE STANDARD, not {block.type}")
-    if block.curvature != 0.0 and not is_axial(file, where):
-        raise InputError(f"{place}: a curved object is not held (CURV)")
     if any(own_axes(block)):
         raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")
     medium = glass(block.words("GLAS"), place=place)
@@ -280,6 +279,15 @@ def _object(
         return medium, None
     distance = block.length("DISZ")
     return medium, None if abs(distance) >= _INFINITE else distance
+
+
+def _curved_object(
+    file: ZemaxFile, prescription: dict[str, Any], factor: Fraction, where: str
+) -> list[str]:
+    """Return a sentence about an object that is no plane."""
+    place = f"{where}: the object"
+    block = SurfaceBlock(file.surfaces[0], factor, place)
+    return curved_object(prescription, curvature_row(block.curvature), place)
 
 
 def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:

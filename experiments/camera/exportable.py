@@ -30,6 +30,7 @@ _RESTORED = (
 )
 # No picture is larger than this, in multiples of what the network needs.
 _MOST = 4096
+_MOST_PIXELS = 64_000_000
 # Rows and columns that a network of any size is traced and checked with: a sensor's million pixels
 # would take minutes and gigabytes, and show no more.
 _TRACED = 256
@@ -155,6 +156,10 @@ def exportable(
     """
     if min(size or (1, 1)) < 1 or (multiple is not None and multiple < 1):
         raise InputError(f"image size {size}, multiple of {multiple}: must be positive numbers")
+    if size is not None and size[0] * size[1] > _MOST_PIXELS:
+        raise InputError(f"image size {size}: allowed: {_MOST_PIXELS:.3g} pixels at most")
+    if multiple is not None and multiple > _MOST:
+        raise InputError(f"multiple of {multiple}: allowed: {_MOST} at most")
     if camera.network.needs_noise:
         raise InputError(
             f"network: {type(camera.network).__name__} is no network of tensors alone, and is not "

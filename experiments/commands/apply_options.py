@@ -9,10 +9,11 @@ from dolens.experiments.camera.restored_windows import (
     DEFAULT_WINDOW,
     GRID,
 )
+from dolens.experiments.camera.views.whole import DIFFRACTION
 from dolens.sensor.image_files import MEGAPIXELS
 
 # Pixels of a picture to one of the sensor.
-_LARGEST_SCALE = 1000.0
+_SMALLEST_SCALE, _LARGEST_SCALE = 0.01, 1000.0
 _FORMATS = ("png", "tif")
 
 
@@ -59,14 +60,22 @@ class Options:
             raise InputError(f"--window: {self.window}; allowed: multiples of {GRID}, pixels")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"--seed: {self.seed}; allowed: 0 to 2^63 - 1")
-        if self.scale is not None and not 0.0 < self.scale <= _LARGEST_SCALE:
+        if self.scale is not None and not _SMALLEST_SCALE <= self.scale <= _LARGEST_SCALE:
             raise InputError(
-                f"--scale: {self.scale:g}; allowed: above 0, to {_LARGEST_SCALE:g} pixels"
+                f"--scale: {self.scale:g}; allowed: {_SMALLEST_SCALE:g} to "
+                f"{_LARGEST_SCALE:g} pixels"
             )
         if not all(0.0 < depth < math.inf for depth in self.depths):
             raise InputError(f"--depth: {self.depths}; allowed: positive numbers, mm")
-        if not self.megapixels > 0.0:
+        if not 0.0 < self.megapixels < math.inf:
             raise InputError(f"--megapixels: {self.megapixels:g}; allowed: above 0")
+        for level in ("black", "white"):
+            if not math.isfinite(getattr(self, f"{level}_level") or 0.0):
+                raise InputError(f"--{level}-level: must be a finite number")
+        if self.white_level is not None and not self.white_level > (self.black_level or 0.0):
+            raise InputError(f"--white-level: {self.white_level:g}; allowed: above black")
+        if self.diffraction is not None:
+            check_choice(self.diffraction, DIFFRACTION, "--diffraction")
         if not self.raw and (self.black_level, self.white_level) != (None, None):
             raise InputError("--black-level and --white-level are of raw files; give --raw too")
         if self.raw and (self.depths or self.scale or self.diffraction or self.save_raw):

@@ -1,6 +1,7 @@
 """The camera of a run again, without training: on other photographs, depths, noise."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from dolens.experiments.commands.evaluation_overrides import (
     refuse_other_work,
     with_own_calibration,
 )
+from dolens.experiments.data.camera_data import CropDataModule
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import FinishedRun, load_recorded
 from dolens.experiments.running.made_trainer import quiet_lightning
@@ -40,6 +42,7 @@ from dolens.experiments.running.run_folder import (
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import summary_of
 from dolens.experiments.running.trust import own_folder
+from dolens.file_text import resolved_path
 from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)
@@ -136,9 +139,12 @@ def own_metrics(found: Evaluated) -> dict[str, float]:
 
 def _new_folder(folder: Path, name: str | None) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") if name is None else name
-    if not name or Path(name).name != name:
+    if not name or Path(name).name != name or not name.isprintable():
         raise InputError(f"--name: '{name}'; allowed: the name of a folder, without /")
-    found = own_folder(folder, "evaluation") / name
+    try:
+        found = resolved_path(own_folder(folder, "evaluation") / name)
+    except InputError as error:
+        raise InputError(f"--name: {error}") from None
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found
@@ -195,9 +201,13 @@ def _tested(
     if not settings.trainer.get("enable_progress_bar", True):
         unwanted = (ModelCheckpoint, ProgressBar)
     kept = [callback for callback in callbacks if not isinstance(callback, unwanted)]
+    own = {"callbacks": kept, "logger": False, "enable_checkpointing": False}
     trainer: lightning.Trainer = run.made(
-        "trainer", settings.trainer, callbacks=kept, logger=False, enable_checkpointing=False
+        "trainer", settings.trainer, **own, **_one_process(settings.trainer)
     )
+    if isinstance(run.data, CropDataModule):
+        # The crops are the same by any number of processes that cut them.
+        run.data.num_workers = min(run.data.num_workers, os.cpu_count() or 1)
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))
     info["evaluated"] = dict(evaluated)
@@ -216,6 +226,16 @@ def _tested(
     metrics = dict(trainer.callback_metrics) | summary_of(run.module)
     metrics["cost/peak_memory_mb"] = peak_memory_mb(device)
     return metrics
+
+
+def _one_process(trainer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of the trainer by which no other process is started, whatever the run had.
+
+    One device that is chosen by its number stays.
+    """
+    devices = trainer.get("devices")
+    chosen = isinstance(devices, Sequence) and not isinstance(devices, str) and len(devices) == 1
+    return {"devices": list(devices) if chosen else 1, "num_nodes": 1, "strategy": "auto"}
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from dolens.reconstruction.intervals import Interval
 NONE = "–"
 # So many experiments are named in a title.
 _FEW = 2
+_JUDGE = re.compile(r"\w{1,100}")
 GAIN_HEADING = ("row", "metric", "gain", "seeds", "photographs")
 
 
@@ -102,6 +104,8 @@ def compared(
     Raises:
         InputError: there is no finished run, no such metric or no such row.
     """
+    if judge is not None and not _JUDGE.fullmatch(judge):
+        raise InputError(f"--judge: '{judge}'; allowed: a word, as wave for test_wave/...")
     found = find_runs(folders, judge)
     rows = rows_of(found.runs)
     chosen = tuple(chosen_metrics(rows, metrics))

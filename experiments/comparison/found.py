@@ -7,6 +7,7 @@ from pathlib import Path
 from dolens.errors import InputError
 from dolens.experiments.comparison.run import Run, UnfinishedRun, read_run, read_unfinished
 from dolens.experiments.running.run_files import CONFIG, HYDRA, has_metrics
+from dolens.file_text import resolved_path
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def find_runs(folders: Iterable[Path], judge: str | None = None) -> FoundRuns:
     places: dict[Path, None] = {}
     no_runs: list[str] = []
     for folder in folders:
-        if not folder.is_dir():
+        if not resolved_path(folder).is_dir():
             what = "is no folder" if folder.exists() else "does not exist"
             no_runs.append(f"{folder} {what}")
             continue

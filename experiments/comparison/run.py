@@ -127,7 +127,7 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
         tuple(override.lstrip("+~").partition("=")[0] for override in job.overrides),
         objectives,
         _judged(metrics_of(folder), judge),
-        read_scores(folder, f"test_{judge}" if judge else "test"),
+        read_scores(folder, "test" if judge is None else f"test_{judge}"),
         _code(folder),
     )
 

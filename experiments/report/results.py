@@ -15,6 +15,7 @@ from dolens.experiments.running.run_files import (
     read_json,
     read_yaml,
 )
+from dolens.file_text import resolved_path
 
 RECORD = "report_run.json"
 # Settings that change nothing in what a run finds.
@@ -112,6 +113,7 @@ def assigned(plan: Plan, given: Sequence[str]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for entry in given:
         name, equals, path = entry.partition("=")
+        resolved_path(path or entry)
         if equals and name in [system.name for system in plan.systems]:
             found[name] = _finished(Path(path))
             continue

@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.recorded_run import RecordedRun
+from dolens.file_text import resolved_path
 
 CHECKPOINTS = ("last", "best")
 
@@ -20,7 +21,7 @@ def checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
         InputError: there is none.
     """
     if str(checkpoint) not in CHECKPOINTS:
-        file = Path(checkpoint).expanduser().resolve()
+        file = resolved_path(checkpoint)
         if not file.is_file():
             raise InputError(
                 f"checkpoint: {checkpoint} does not exist; allowed: {', '.join(CHECKPOINTS)}, or "

@@ -26,6 +26,7 @@ from dolens.experiments.running.run_files import (
 )
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
+from dolens.file_text import resolved_path
 
 _RECORDS = (RESOLVED, HYDRA, OVERRIDES, INFO)
 
@@ -95,9 +96,9 @@ def read_record(
     Raises:
         InputError: the folder is none of a run, its record cannot be read, or it needs trust.
     """
-    folder = Path(folder).expanduser().resolve()
+    folder = resolved_path(folder)
     _check_folder(folder)
-    output = folder if output is None else Path(output).expanduser().resolve()
+    output = folder if output is None else resolved_path(output)
     job = job_of(folder)
     config = read_yaml(folder / RESOLVED) or {}
     for path, value, _ in walk("", config):

@@ -17,6 +17,7 @@ import dolens.optimize
 import dolens.reconstruction
 from dolens.errors import InputError
 from dolens.experiments.running.plain_values import walk
+from dolens.file_text import resolved_path
 from dolens.packaged import packaged_configuration
 
 _TARGET = re.compile(r"_target_: *(?:([\w.]+))")
@@ -92,7 +93,7 @@ def own_folder(run: str | Path, name: str) -> Path:
     Raises:
         InputError: it is a link or holds one, through which a file elsewhere would be written.
     """
-    folder = Path(run).expanduser().resolve() / name
+    folder = resolved_path(run) / name
     for path in (folder, *folder.rglob("*")):
         if path.is_symlink():
             raise InputError(f"{path} is a link, and would be written through; remove it")
@@ -113,7 +114,7 @@ def _needs(config: Mapping[str, Any], output: Path | None) -> Iterator[tuple[str
         elif key == "_args_":  # which would pass what is looked at by its name below
             yield "give a call arguments without names", place
         elif key in _WRITTEN and output is not None and isinstance(value, str):
-            if not Path(value).expanduser().resolve().is_relative_to(output):
+            if not resolved_path(value).is_relative_to(output):
                 yield f"write into {value}", path
         elif key == "settings" and isinstance(value, list):
             for text in map(str, value):

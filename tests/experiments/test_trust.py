@@ -1,5 +1,6 @@
 """A stranger's run folder is data: what it may call, import and write is known beforehand."""
 
+import os
 import pkgutil
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from shutil import copytree
 
 import pytest
 import yaml
+from lightning import Trainer
 
 from dolens.errors import InputError
 from dolens.experiments.commands.apply import apply_run
@@ -184,6 +186,42 @@ def test_a_module_of_one_s_own_is_imported_where_the_run_is_trusted(folder):
     changed(folder, "extensions", ["module_of_a_stranger"])
     assert load_run(folder, trust=True).step == 2
     assert Path("executed").exists() and sys.modules.pop("module_of_a_stranger")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"devices": 8, "accelerator": "cpu"},
+        {"devices": "auto", "strategy": "ddp", "accelerator": "cpu"},
+        {"devices": 2, "num_nodes": 3, "strategy": "ddp_spawn", "accelerator": "cpu"},
+        {"devices": [0, 1], "strategy": "fsdp", "accelerator": "cpu"},
+    ],
+)
+def test_a_run_of_many_processes_is_evaluated_in_one(settings, folder, monkeypatch):
+    for key, value in settings.items():
+        changed(folder, f"trainer.{key}", value)
+    made = []
+    monkeypatch.setattr(Trainer, "test", lambda trainer, *_, **__: made.append(trainer))
+    evaluate(folder, name="again")
+    (trainer,) = made
+    assert (trainer.world_size, trainer.num_nodes, trainer.strategy.launcher) == (1, 1, None)
+
+
+def test_no_more_processes_cut_crops_than_there_are_processors(folder, monkeypatch):
+    changed(folder, "data.num_workers", 1000)
+    made = []
+    monkeypatch.setattr(Trainer, "test", lambda trainer, module, data, **_: made.append(data))
+    evaluate(folder, name="again")
+    (data,) = made
+    assert data.num_workers == os.cpu_count()
+
+
+@pytest.mark.parametrize("key", ["plugins", "strategy", "accelerator", "profiler", "logger"])
+def test_parts_of_a_trainer_that_a_stranger_names_are_not_made(key, folder, root):
+    call = {"_target_": f"lightning.pytorch.{key}.Anything", "cluster": {"_target_": "os.fork"}}
+    changed(folder, f"trainer.{key}", [call])
+    for message in refusals(folder, root / "docs/lenses.png"):
+        assert f"would call lightning.pytorch.{key}.Anything (trainer.{key}" in message
 
 
 def configuration_files(root):

@@ -110,6 +110,7 @@ def resonances(number):
 @pytest.mark.parametrize("number", range(1, 14))
 def test_every_formula_at_fifty_digits(number):
     words = COEFFICIENTS if number in (1, 10, 12, 13) else resonances(number)
+    words = words[: {1: 6, 2: 6, 6: 8, 10: 8, 12: 8, 13: 9}.get(number)]
     text = f"NM G {number} 0 1.5 60\nCD {' '.join(words)}\nLD 0.3 2.5\n"
     formula, constant, terms = read_entry(catalogue(text)["G"]).dispersion
     with mpmath.workdps(50):

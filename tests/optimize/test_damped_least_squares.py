@@ -1,5 +1,7 @@
 """Damped least squares on problems whose solutions others have certified."""
 
+import math
+
 import pytest
 import torch
 
@@ -302,3 +304,27 @@ def test_problems_without_variables_or_residuals_are_named():
     u = torch.ones(2, dtype=torch.float64, requires_grad=True)
     with pytest.raises(InputError, match=r"^least squares: there are no residuals$"):
         DampedLeastSquares([u]).step(lambda: u[:0])
+
+
+@pytest.mark.parametrize(
+    "returned, said",
+    [
+        (lambda u: None, "the closure returns NoneType; allowed: a tensor of residuals"),
+        (lambda u: 3.0, "the closure returns float; allowed"),
+        (lambda u: [u], "the closure returns list; allowed"),
+        (lambda u: u * 1j, "the residuals are complex"),
+        (lambda u: torch.ones(3), "have no gradient"),
+        (lambda u: u * math.nan, "the merit is nan"),
+        (lambda u: u * 1e300, "the merit is inf"),
+    ],
+)
+def test_a_closure_that_returns_no_residuals_is_named(returned, said):
+    u = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    with pytest.raises(InputError, match=said):
+        DampedLeastSquares([u]).step(lambda: returned(u))
+
+
+def test_a_variable_without_a_gradient_is_named():
+    u, fixed = (torch.ones(2, dtype=torch.float64, requires_grad=g) for g in (True, False))
+    with pytest.raises(InputError, match="a variable has no gradient"):
+        DampedLeastSquares([u, fixed]).step(lambda: u * fixed)

@@ -332,11 +332,28 @@ def test_bad_pickups_and_solves_are_refused(triplet, variables, said):
         ),
         ({"fields": [[0.0, 1e9]]}, r"merit.fields: \[0.0, 1000000000.0\] degrees; allowed"),
         ({"field_weights": [1e300, 1.0]}, "merit.field_weights: give 2 numbers from 0 to 1e"),
+        ({"field_weights": ["a", "b"]}, r"merit.field_weights: \['a', 'b'\]; allowed: a list"),
+        ({"fields": 3.0}, "merit.fields: 3.0; allowed: a list"),
+        ({"fields": [3.0]}, r"merit.fields: \[3.0\]; allowed: a list"),
+        ({"wavelengths": ["a"]}, r"merit.wavelengths: \['a'\]; allowed: a list"),
+        ({"max_vignetting": "a"}, "merit.max_vignetting: 'a'; allowed: a number"),
+        ({"operands": 3}, "merit.operands: 3; allowed: a list"),
+        ({"operands": [{"kind": "distortion", "target": 0.0, "field": 1e9}]}, "is x and y, not 1"),
+        ({"operands": [{"kind": "efl", "target": math.inf}]}, "'efl': target must be a number"),
+        ({"operands": [{"kind": "efl", "min": math.nan}]}, "'efl': min must be a number, not nan"),
+        ({"sampling_options": {"rings": 10**9}}, "rings and arms: 1000000000 and 12; allowed: 2"),
+        ({"sampling": "square_grid", "sampling_options": {"count": 10**6}}, "count: 1000000; all"),
     ],
 )
 def test_numbers_out_of_all_proportion_are_named(triplet, options, words):
     with pytest.raises(InputError, match=words):
         merit_of(triplet, **options)
+
+
+def test_a_target_beyond_all_numbers_has_no_merit(triplet):
+    merit, variables = merit_of(triplet, operands=[{"kind": "efl", "target": 1e300}])
+    with pytest.raises(InputError, match="cannot begin: the merit is inf"):
+        DampedLeastSquares([variables.scaled]).step(merit)
 
 
 def test_operands_that_no_variable_moves_are_named(triplet):

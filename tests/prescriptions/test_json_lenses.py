@@ -3,12 +3,18 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import pytest
+import torch
 
 from dolens import load_lens, save_lens
+from dolens.optics.rays import Rays
+from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.json_lenses import json_of, read_json
 from tests.prescriptions.samples import SINGLET, require_refused
+
+PEERS = Path(__file__).parent / "peer_files"
 
 # A singlet in the words of each program: N-BK7, R 20 and -50 mm, 5 mm thick, stop in front.
 DEEPLENS = {
@@ -253,3 +259,32 @@ def test_apertures_of_optiland(aperture, row):
     content["surface_group"]["surfaces"][3]["aperture"] = aperture
     found = read_json(json.dumps(content), "lens").prescription["surfaces"]["3"]
     assert {key: found.get(key) for key in row} == row
+
+
+def test_rays_through_a_tilted_asphere_land_where_deeplens_has_them():
+    """Of the file as DeepLens 2.5.6 writes it, with two surfaces tilted and one decentred; its own
+    numbers, in single precision.
+    """
+    content = json.loads((PEERS / "deeplens_rich.json").read_text())
+    content["surfaces"][1] |= {"pos_xy": [0.1, -0.2], "vec_local": [0.03, 0.05, 0.9983]}
+    content["surfaces"][5] |= {"vec_local": [0.2, 0.15, 0.968]}
+    lens = lens_from_prescription(read(content))
+    at = torch.tensor([[0.5, 0.7, -1.0], [1.5, -0.4, -1.0], [-1.0, 1.0, -1.0], [1.9, 1.9, -1.0]])
+    along = torch.tensor([0.0, 0.0, 1.0]).expand_as(at)
+    found = lens.trace(Rays(at.double(), along.double(), 587.0)).position[:, :2]
+    theirs = [[0.97186, 0.13288], [0.26072, 0.92367], [2.048, -0.10852], [-0.0011486, -0.72002]]
+    assert (found - torch.tensor(theirs)).abs().max() < 2e-5
+
+
+def test_a_square_of_deeplens_has_r_as_half_its_diagonal():
+    content = changed(DEEPLENS, ("surfaces", 1, "is_square"), True)
+    half = 10.0 / math.sqrt(2.0)
+    sides = {"half_width_x": half, "half_width_y": half}
+    assert read(content)["surfaces"]["2"]["aperture"] == sides
+
+
+@pytest.mark.parametrize(("legacy", "first"), [(True, "a2"), (False, "a4")])
+def test_the_first_coefficient_of_deeplens_follows_use_ai2(legacy, first):
+    content = changed(DEEPLENS, ("surfaces", 1, "use_ai2"), legacy)
+    content["surfaces"][1]["ai"] = [1e-6, 1e-9]
+    assert read(content)["surfaces"]["2"][first] == 1e-6

@@ -96,7 +96,11 @@ def test_what_a_file_says_of_its_system():
     assert found["fields"] == {"angles": [[0.0, 0.0], [0.0, 20.0]]}
     assert found["entrance_pupil_diameter"] == 10.2
     assert "object_distance" not in found
-    assert said == ["solves, whose values are written"]
+    assert said == [
+        "solves, whose values are written",
+        "names and drawing (DES)",
+        "settings of the program (CBK)",
+    ]
 
 
 @pytest.mark.parametrize("u", [1.0, 10.0, 25.4])

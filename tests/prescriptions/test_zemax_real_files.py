@@ -148,7 +148,9 @@ def test_a_curved_object_is_a_plane_to_fields_on_the_axis(field, held):
     if held:
         assert prescription_from_zemax(text)["object_distance"] == 90.0
     else:
-        with pytest.raises(InputError, match=r"the object: a curved object is not held \(CURV\)"):
+        with pytest.raises(
+            InputError, match=r"the object: a curved object \(radius 10 mm\) is not held"
+        ):
             prescription_from_zemax(text)
 
 

@@ -44,6 +44,7 @@ class CodeVFile:
         wavelengths: of the private glasses, as written.
         zoom: commands about further positions.
         solved: whether the paraxial image solve is on.
+        passed_over: what commands that bend no ray are about → their keys.
     """
 
     system: dict[str, list[Command]] = field(default_factory=dict)
@@ -52,6 +53,7 @@ class CodeVFile:
     wavelengths: list[str] = field(default_factory=list)
     zoom: list[Command] = field(default_factory=list)
     solved: bool = False
+    passed_over: dict[str, dict[str, None]] = field(default_factory=dict)
 
 
 def parse_codev(text: str, where: str) -> CodeVFile:
@@ -91,8 +93,11 @@ def parse_codev(text: str, where: str) -> CodeVFile:
             _add(file, command, place)
         elif key in SYSTEM:
             file.system.setdefault(key, []).append(command)
-        elif key not in WITHOUT_EFFECT:
-            raise InputError(_refusal(command, place))
+        else:
+            group = next((name for name, keys in WITHOUT_EFFECT.items() if key in keys), None)
+            if group is None:
+                raise InputError(_refusal(command, place))
+            file.passed_over.setdefault(group, {})[key] = None
     labels = [block.label for block in file.surfaces]
     if labels[:1] != ["SO"] or labels[-1:] != ["SI"] or len(labels) < 3:
         raise InputError(f"{where}: needs an object (SO), surfaces (S) and an image (SI), in order")

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from decimal import Decimal
 from itertools import combinations, pairwise
 
-from dolens.errors import InputError
+from dolens.errors import InputError, comma_hint
 from dolens.optics.glass_catalog import find_glass, likely_makers, makers_of
 from dolens.optics.materials import abbe_number, index_model, parse_material
 from dolens.prescriptions.codev.file import CodeVFile
@@ -138,7 +138,7 @@ def _named(name: str, place: str) -> str:
         where = f" of {catalogue}" if word else ""
         raise InputError(
             f"{place}: glass {name} is not known here{where}; write its nd and Vd as a code, such "
-            "as 517.642"
+            f"as 517.642{comma_hint(name)}"
         )
     if len(found) > 1:
         raise InputError(

@@ -2,7 +2,7 @@
 
 # Aperture, fields, wavelengths and surroundings of the system.
 SYSTEM = (
-    *("TIT", "DIM", "EPD", "FNO", "NA", "NAO", "WL", "REF", "WTW", "TEM", "PRE", "PUI", "IFO"),
+    *("TIT", "DIM", "EPD", "FNO", "NA", "NAO", "WL", "REF", "WTW", "TEM", "PRE", "PUI"),
     *("XAN", "YAN", "XOB", "YOB", "XIM", "YIM", "XRI", "YRI", "WTF", "VUX", "VLX", "VUY", "VLY"),
     "TEL",
 )
@@ -14,16 +14,21 @@ SURFACE = (
     *("CIR", "REX", "REY", "ELX", "ELY", "ADX", "ADY", "ARO"),
     *("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "XOD", "YOD", "ZOD", "DAR", "BEN", "REV"),
 )
-# What bends no ray: variables and derivatives, names, drawing, tolerances, limits of optimization,
-# and solves and pick-ups, whose results are written anyway.
-WITHOUT_EFFECT = (
-    *("INI", "CA", "CWL", "CLS", "UID", "DER", "DOR", "POL", "PIK", "IC", "COM"),
-    *("CCY", "CCX", "THC", "GLC", "KC", "AC", "BC", "CC", "DC", "EC", "FC", "GC", "HC", "JC"),
-    *("CCF", "XDC", "YDC", "ZDC", "ADC", "BDC", "CDC", "HCC", "SCC", "CUM", "THM", "RDM"),
-    *("TDY", "TDX", "TDR", "TDZ", "TTA", "TTB", "TTC", "TIR", "DLF", "DLT", "DLN", "DLV", "DLZ"),
-    *("DLA", "DLB", "DLC", "DLX", "DLY", "DLK", "DLR", "DLS", "BTI", "BTX", "BTY", "TRX", "TRY"),
-    *("CYD", "CYN", "CYT", "TOL", "ACO", "VIE", "WID"),
-)
+# What bends no ray, by what it is about; the results of solves and pick-ups are written anyway.
+WITHOUT_EFFECT = {
+    "variables, couplings and limits of an optimization": (
+        *("CCY", "CCX", "THC", "GLC", "KC", "AC", "BC", "CC", "DC", "EC", "FC", "GC", "HC", "JC"),
+        *("CCF", "XDC", "YDC", "ZDC", "ADC", "BDC", "CDC", "HCC", "SCC", "CUM", "THM", "PIK"),
+    ),
+    "tolerances": (
+        *("TDY", "TDX", "TDR", "TDZ", "TTA", "TTB", "TTC", "TIR", "DLF", "DLT", "DLN", "DLV"),
+        *("DLZ", "DLA", "DLB", "DLC", "DLX", "DLY", "DLK", "DLR", "DLS", "BTI", "BTX", "BTY"),
+        *("TRX", "TRY", "CYD", "CYN", "CYT", "TOL", "COM"),
+    ),
+    "polarization": ("POL",),
+    "settings of the program": ("CA", "CWL", "CLS", "DER", "DOR", "IC", "IFO", "ACO"),
+    "": ("INI", "UID", "VIE", "WID"),
+}
 # What bends rays and is not held: three letters → the name that optics gives it.
 REFUSED = {
     "CYL": "a cylinder",

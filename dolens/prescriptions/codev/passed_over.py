@@ -30,7 +30,8 @@ def passed_over(file: CodeVFile) -> list[str]:
         found.append("edges and holes, which CODE V draws (EDG, HOL)")
     if any(_is_solve(block.commands) for block in blocks):
         found.append("solves, whose values are written (THI, CUY)")
-    return found
+    groups = {group: ", ".join(keys) for group, keys in file.passed_over.items() if group}
+    return [*found, *(f"{group} ({keys})" for group, keys in groups.items())]
 
 
 def require_first_position(file: CodeVFile, where: str) -> None:

@@ -27,11 +27,13 @@ from dolens.prescriptions.codev.surface import (
     Surface,
     conic_constant,
     curvature_row,
+    object_shape,
     read_surface,
     shape_is_given,
 )
 from dolens.prescriptions.codev.system import factor_to_mm, read_system
 from dolens.prescriptions.codev.text import opening_remarks
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.decimals import exact, nearest, number_in_text
 from dolens.prescriptions.paraxial_image import paraxial_image
 from dolens.prescriptions.read_file import ReadPrescription
@@ -91,7 +93,9 @@ def read_codev(text: str, where: str = "lens") -> ReadPrescription:
     if distance is not None:
         found["object_distance"] = summed(distance, shift, where)
     prescription = _with_sensor(found, rows, axes[-1], image, factor, where)
-    return ReadPrescription(prescription, passed_over(file))
+    shape = object_shape(target, factor, f"{where}: surface SO (the object)")
+    curved = curved_object(prescription, shape, f"{where}: surface SO (the object)")
+    return ReadPrescription(prescription, [*passed_over(file), *curved])
 
 
 def _rows(
@@ -206,8 +210,6 @@ def _solved(
 def _object_distance(target: Block, factor: Fraction, where: str) -> Fraction | None:
     """Return the distance of the object in mm, or None for infinity."""
     place = f"{where}: surface SO (the object)"
-    if curvature_row(target, factor, place) or shape_is_given(target):
-        raise InputError(f"{place}: a curved object is not held")
     own = Axes(target, factor, place)
     if own.before or own.after or own.shift_before:
         raise InputError(f"{place}: a decentred or tilted object is not held")

@@ -62,7 +62,7 @@ def special_shape(
     if kind not in _HELD:
         what = _NAMES.get(kind, "a special surface")
         raise InputError(f"{place}: {what} is not held (SPS {kind})".rstrip())
-    texts = _coefficients(block, "SCO", f"{place}: SCO")
+    texts = _coefficients(block, "SCO", f"{place}: SCO", named=kind == "ODD")
     if kind == "ODD":
         return _odd(texts, words[1:], size, factor, place)
     if kind == "QBF":
@@ -196,22 +196,22 @@ def _odd(
     return row
 
 
-def _number(name: str) -> int | None:
-    """Return the number of a coefficient, which an odd asphere's may have a name for."""
-    if name == "K":
-        return 1
+def _number(name: str, named: bool) -> int | None:
+    """Return the number of a coefficient; an odd asphere's may have names."""
     match = _NUMBER.fullmatch(name)
     if match is not None:
         return int(match[1])
-    match = _ODD_NAME.fullmatch(name)
+    if named and name == "K":
+        return 1
+    match = _ODD_NAME.fullmatch(name) if named else None
     return None if match is None else int(match[1]) + 1
 
 
-def _coefficients(block: Block, key: str, place: str) -> dict[int, str]:
-    """Return the texts of numbered coefficients."""
+def _coefficients(block: Block, key: str, place: str, named: bool = False) -> dict[int, str]:
+    """Return the texts of numbered coefficients, which may be those that have names, too."""
     found: dict[int, str] = {}
     for command in block.commands.get(key, []):
-        number = _number(command.words[0].upper()) if command.words else None
+        number = _number(command.words[0].upper(), named) if command.words else None
         if number is None or len(command.words) != 2:
             raise InputError(f"{place} (line {command.at}): expected a coefficient, as C4 0.1")
         found[number] = command.words[1]

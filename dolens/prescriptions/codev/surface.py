@@ -89,6 +89,11 @@ def curvature_row(block: Block, factor: Fraction, place: str) -> dict[str, float
     return _curvature(block, factor, place)
 
 
+def object_shape(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
+    """Return the shape of an object as a prescription's row has it."""
+    return _shape(block, _curvature(block, factor, place), False, factor, place)
+
+
 def shape_is_given(block: Block) -> bool:
     """Return whether a block names a shape or coefficients."""
     return any(key in block.commands for key in ("SPH", "CON", "ASP", "K", "SPS", *_COEFFICIENTS))

@@ -41,19 +41,21 @@ def commands_of(text: str, where: str) -> list[Command]:
         InputError: a line, with what continues it, is longer than 100 000 letters.
     """
     found: list[Command] = []
-    held, begins = "", 0
+    held: list[str] = []
+    length, begins = 0, 0
     for at, line in enumerate(_LINE_END.split(text), 1):
-        if len(held) + len(line) > _LONGEST_LINE:
+        if length + len(line) > _LONGEST_LINE:
             raise InputError(f"{where}: line {at} is longer than {_LONGEST_LINE} letters")
         code = _without_remark(line)
         begins = begins if held else at
-        held += code
-        if held.endswith("&"):
-            held = held[:-1] + " "
+        length += len(code)
+        if code.endswith("&"):
+            held.append(code[:-1] + " ")
             continue
-        found += _commands(held, begins)
-        held = ""
-    return found + _commands(held, begins)
+        if held or code:
+            found += _commands("".join((*held, code)), begins)
+        held, length = [], 0
+    return found + _commands("".join(held), begins)
 
 
 def opening_remarks(text: str) -> str:
@@ -74,6 +76,8 @@ def unquoted(word: str) -> str:
 
 
 def _without_remark(line: str) -> str:
+    if "!" not in line:
+        return line.rstrip()
     for match in _WORD.finditer(line):
         if match["remark"] is not None:
             return line[: match.start()].rstrip()

@@ -13,6 +13,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
+from dolens.prescriptions.curved_object import curved_object
 from dolens.prescriptions.decimals import exact, nearest, number_in_text, radius_of, scaled
 from dolens.prescriptions.field_data import unequal_weights
 from dolens.prescriptions.oslo.text import POWERS, Line, OsloFile, parse_oslo
@@ -37,6 +38,9 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     factor = _factor(file, where)
     target, *blocks, image = file.surfaces
     distance = _object_distance(target, factor, where)
+    place = f"{where}: surface 0 (the object)"
+    seen = {"object_distance": distance, **_field(file, factor, where)}
+    curved = curved_object(seen, _shape(target, factor, place), place)
     prescription = _system(file, factor, distance is not None, where)
     medium = prescription["object_material"] = _medium(target, f"{where}: surface 0")
     if distance is not None:
@@ -69,8 +73,9 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     behind = _words(image, "TH")
     gap = gaps[-1] + (exact(behind[0], f"{place}: TH") * factor if behind else 0)
     prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
-    solves = any("SOLVE" in block for block in blocks)
-    return ReadPrescription(prescription, ["solves, whose values are written"] if solves else [])
+    solves = ["solves, whose values are written"] if any("SOLVE" in b for b in blocks) else []
+    groups = [f"{group} ({', '.join(keys)})" for group, keys in file.passed_over.items()]
+    return ReadPrescription(prescription, [*solves, *groups, *curved])
 
 
 def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
@@ -91,10 +96,14 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
         weighed = unequal_weights(weights, len(values), f"{where}: WW")
         if weighed:
             found["wavelength_weights"] = weighed
-    return found | _field(file, factor, finite, where) | _pupil(file, factor, finite, where)
+    for command, key, usual in (("TEM", "temperature", 20.0), ("PRE", "pressure", 1.0)):
+        words = _words(file.system, command)
+        if words and number_in_text(words[0], f"{where}: {command}") != usual:
+            found[key] = float(words[0])
+    return found | _field(file, factor, where) | _pupil(file, factor, finite, where)
 
 
-def _field(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
+def _field(file: OsloFile, factor: Fraction, where: str) -> dict[str, Any]:
     """Return the axis and the edge of the field."""
     for command, kind, unit in (
         ("ANG", "angles", Fraction(1)),
@@ -142,8 +151,6 @@ def _factor(file: OsloFile, where: str) -> Fraction:
 
 def _object_distance(target: Block, factor: Fraction, where: str) -> float | None:
     place = f"{where}: surface 0 (the object)"
-    if _shape(target, factor, place) != {"type": "plane"}:
-        raise InputError(f"{place}: a curved object is not held")
     _refuse_places(target, place)
     words = _words(target, "TH")
     if not words or abs(number_in_text(words[0], place)) >= _INFINITE:

@@ -16,20 +16,24 @@ _LONGEST_LINE = 20_000
 _MOST_SURFACES = 2000
 _WORD = re.compile(r'"[^"]*"?|[^\s"]+')
 
-SYSTEM = (
-    *("LEN", "DES", "UNI", "EBR", "FNO", "NAO", "ANG", "OBH", "GIH", "WV", "WW", "CBK", "RAI"),
-    *("RAIM", "SNO", "PRE", "TEM", "AFO", "APO"),
-)
+SYSTEM = (*("LEN", "UNI", "EBR", "FNO", "NAO", "ANG", "OBH", "GIH", "WV", "WW", "PRE", "TEM"),)
 SURFACE = (
-    *("TH", "RD", "CV", "AP", "GLA", "AIR", "RFL", "RFH", "CC", "AST", "ASP", "LBL", "SNO"),
-    *("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "DT", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ"),
+    *("TH", "RD", "CV", "AP", "GLA", "AIR", "RFL", "RFH", "CC", "AST", "ASP"),
+    *("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ"),
 )
 # Coefficients of r⁴, r⁶, ..., r²⁰.
 POWERS = {f"A{letter}": 2 * i for i, letter in enumerate("DEFGHIJKL", 2)}
-_WITHOUT_EFFECT = (
-    *("DES", "DRW", "SPE", "RAIM", "CBK", "DLRS", "DLAS", "DLNR", "DLMN", "DLMX", "DLHA", "VAR"),
-    *("LBL", "DSIG", "CIGN", "SDSD", "WARM", "AFO0", "FCC", "COMM", "TCE"),
-)
+# What bends no ray, by what it is about.
+_WITHOUT_EFFECT = {
+    "names and drawing": ("DES", "DRW", "LBL", "COMM"),
+    "apodization": ("APO",),
+    "tolerances": (
+        *("DLRS", "DLAS", "DLNR", "DLMN", "DLMX", "DLHA", "DSIG", "CIGN", "SDSD", "FCC"),
+    ),
+    "variables of an optimization": ("VAR",),
+    "expansion with temperature": ("TCE",),
+    "settings of the program": ("SPE", "RAI", "RAIM", "CBK", "WARM", "AFO0", "DT"),
+}
 _REFUSED = {
     "ASP": "a general aspheric surface",
     "CVX": "a second curvature, across x",
@@ -75,11 +79,13 @@ class OsloFile:
         system: command → its last line.
         surfaces: the same for each surface, from the object to the image.
         notes: what OSLO calls system notes, in their order.
+        passed_over: what commands that bend no ray are about → these commands.
     """
 
     system: dict[str, Line] = field(default_factory=dict)
     surfaces: list[dict[str, Line]] = field(default_factory=lambda: [{}])
     notes: list[str] = field(default_factory=list)
+    passed_over: dict[str, dict[str, None]] = field(default_factory=dict)
 
 
 def parse_oslo(text: str, where: str) -> OsloFile:
@@ -124,5 +130,8 @@ def _sort(file: OsloFile, line: Line, place: str) -> None:
         file.surfaces[-1]["SOLVE"] = line
     elif command in SYSTEM:
         file.system[command] = line
-    elif command not in _WITHOUT_EFFECT:
-        raise InputError(f"{place}: command {command} is not known, and may bend rays")
+    else:
+        group = next((name for name, keys in _WITHOUT_EFFECT.items() if command in keys), None)
+        if group is None:
+            raise InputError(f"{place}: command {command} is not known, and may bend rays")
+        file.passed_over.setdefault(group, {})[command] = None
