@@ -38,6 +38,8 @@ def train_for(
 ) -> TrainedFor:
     """Train a network for so much process time as the camera experiment does, but for the lens.
 
+    One without parameters is taken as it is.
+
     The seed decides its first weights, the order of the crops and the noise.  The learning rate
     falls to zero along a cosine, over as many steps as the time is enough for by the first ones.
 
@@ -48,6 +50,8 @@ def train_for(
         seed: of all random numbers.
     """
     torch.manual_seed(seed)
+    if not [*make().parameters()]:
+        return TrainedFor(make().eval(), 0.0, 0)
     trial = _Training(make().train(), optics, seed)
     trial.step(0)
     seconds = sum(trial.step(number) for number in range(_TIMED)) / _TIMED
@@ -122,5 +126,6 @@ def by_photograph(values: Tensor, photographs: Sequence[str]) -> Tensor:
 
 def _pair(network: Restoration, optics: FixedOptics, split: Split, n: int) -> tuple[Tensor, Tensor]:
     raw = optics.raw(split.images[n], _TEST_SEED + n)
-    found = network(raw, optics.functions, None).clamp(0.0, 1.0)
+    noise = [torch.tensor(optics.readout.noise)] if network.needs_noise else []
+    found = network(raw, optics.functions, None, *noise).clamp(0.0, 1.0)
     return found, split.truth[n].float().expand_as(found)
