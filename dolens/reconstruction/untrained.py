@@ -189,7 +189,7 @@ class WienerBM3DRestoration(UntrainedRestoration):
     def __init__(
         self,
         noise_to_signal: Sequence[float] = (0.3, 2.1, 6.0),
-        strength: float = 1.5,
+        strength: float = 3.0,
     ) -> None:
         super().__init__(noise_to_signal)
         if not strength > 0.0:
