@@ -407,7 +407,13 @@ def traced(lens, rays, backend, sense=1.0, device="cpu", dtype=F64):
 
 
 def _kind(name):
-    """What a parameter is: its name without numbers and axes."""
+    """What a parameter is: its name without numbers and axes.
+
+    The sensor's distance is a shift, as a ray's start: where rays begin at the sensor, shifts of
+    both cancel, and what is left is rounding that the processor decides.
+    """
+    if name == "sensor_distance":
+        return "position"
     return re.sub(r"\d+|_[xyz]$", "", name)
 
 

@@ -92,7 +92,9 @@ def test_a_hyperboloid_images_its_focus_and_a_cassegrain_an_axial_beam():
     hit = lens.trace(axial_beam(95.0, z=-600.0))
     assert hit.valid.all()
     assert hit.position[:, :2].abs().max() < 1e-12
-    assert (hit.path_length - hit.path_length[0]).abs().max() < 1e-12
+    # Of 1300 mm, in a few roundings: how many, the processor's instructions decide.
+    differences = (hit.path_length - hit.path_length[0]).abs() / hit.path_length[0]
+    assert differences.max() < 10.0 * torch.finfo(F64).eps
     assert (hit.direction[:, 2] > 0.0).all()
     first = lens.first_order()
     # The secondary magnifies three times.

@@ -81,7 +81,7 @@ def work(rank, store, results):
 def two(tmp_path_factory):
     """What each of two processes has found."""
     store = tmp_path_factory.mktemp("store") / "file"
-    context = multiprocessing.get_context("fork")
+    context = multiprocessing.get_context("spawn")
     results = context.Queue()
     started = [context.Process(target=work, args=(rank, store, results)) for rank in range(2)]
     for process in started:
