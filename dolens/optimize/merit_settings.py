@@ -22,7 +22,13 @@ from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
 from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operands import MOST_WEIGHT, Operand, check_angles, operand
+from dolens.optimize.operands import (
+    MOST_WEIGHT,
+    Operand,
+    check_angles,
+    check_operand_fields,
+    operand,
+)
 from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
 from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
@@ -209,8 +215,7 @@ class MeritSettings:
             InputError: an unknown quality or option, or nothing that counts.
         """
         operands = [operand(settings, lens) for settings in self.operands]
-        for one in operands:
-            check_angles([one.field], lens.object_distance, f"operand '{one.kind}': field")
+        check_operand_fields(operands, lens.object_distance)
         if self.quality is None and not operands:
             raise InputError("merit: there are neither a quality nor operands")
         states = self.states_of(lens)

@@ -7,7 +7,7 @@ beyond it.  Its derivatives come from autograd: these are a few numbers, each on
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from functools import cached_property
@@ -216,6 +216,12 @@ def check_angles(
     for field in fields if object_distance is None else ():
         if not all(abs(angle) < 90.0 for angle in field):
             raise InputError(f"{what}: {list(field)} degrees; allowed: between -90 and 90")
+
+
+def check_operand_fields(operands: Iterable[Operand], object_distance: float | None) -> None:
+    """Refuse operands of fields that `check_angles` refuses."""
+    for one in operands:
+        check_angles([one.field], object_distance, f"operand '{one.kind}': field")
 
 
 def _number(value: Any, what: str) -> float:

@@ -1,6 +1,7 @@
 """Restoring networks turn a sensor image into a picture, behind one interface."""
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -59,6 +60,10 @@ class Restoration(nn.Module):
             InputError: an argument that the network needs is None or of another shape.
         """
         raise NotImplementedError
+
+    def noise_arguments(self, noise: Sequence[float]) -> list[Tensor]:
+        """Return what `forward` takes after the field: the noise (2,) where it is asked for."""
+        return [torch.tensor(noise)] if self.needs_noise else []
 
     @property
     def dtype(self) -> torch.dtype:

@@ -76,7 +76,7 @@ class Camera(Experiment):
 
     def noise(self) -> list[Tensor]:
         """Return the noise of the sensor, (2,), in a list; none where the network asks for none."""
-        return [torch.tensor(self.views.readout.noise)] if self.network.needs_noise else []
+        return self.network.noise_arguments(self.views.readout.noise)
 
     def filtered(self, taken: Views, functions: Tensor | None) -> Tensor | None:
         """Return pictures (B, V, 3, H, W) by the network's linear filter alone, display-encoded.

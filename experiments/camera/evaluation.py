@@ -190,20 +190,23 @@ def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
     with camera.exact():
         loss = camera.loss_over_views(restored, truth.to(restored.dtype))
         row = {"loss": loss["total"].expand(truth.shape[:2])}
-        for name, image in (("", restored), ("raw_", linear_to_srgb(taken.raw))):
-            for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
-                row[f"{name}{metric}"] = _compared(measure, image, truth)
-    return row
+        return row | _scored({"": restored, "raw_": linear_to_srgb(taken.raw)}, truth)
 
 
 def _of_rivals(
     camera: Camera, taken: Views, functions: Tensor | None, values: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
     """Return scores (B, V) of restorers that nothing has trained."""
-    with named_stage("untrained restorers"):
+    with named_stage("untrained restorers"), camera.exact():
         images = restored_by_rivals(camera, taken, functions, values)
+        clamped = {f"{name}_": image.clamp(0.0, 1.0) for name, image in images.items()}
+        return _scored(clamped, taken.truth)
+
+
+def _scored(images: Mapping[str, Tensor], truth: Tensor) -> dict[str, Tensor]:
+    """Return scores (B, V) of images, by what their names begin with."""
     return {
-        f"{name}_{metric}": _compared(measure, image.clamp(0.0, 1.0), taken.truth)
+        f"{name}{metric}": _compared(measure, image, truth)
         for name, image in images.items()
         for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity))
     }

@@ -12,7 +12,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operand_values import evaluate_operands
-from dolens.optimize.operands import UnreachableField, check_angles, operand
+from dolens.optimize.operands import UnreachableField, check_operand_fields, operand
 from dolens.optimize.variables import DesignVariables
 
 logger = logging.getLogger(__name__)
@@ -41,8 +41,7 @@ class CameraOperands:
     ) -> None:
         self.object_distance = object_distance if math.isfinite(object_distance) else None
         self.entries = [operand(entry, lens) for entry in settings]
-        for entry in self.entries:
-            check_angles([entry.field], self.object_distance, f"operand '{entry.kind}': field")
+        check_operand_fields(self.entries, self.object_distance)
         self.taken_back = 0
 
     def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:

@@ -146,7 +146,7 @@ def check_reconstruction(
     if network.needs_field:
         field = torch.zeros(1, 2, *size)
     with evaluating(network), torch.no_grad(), torch.random.fork_rng(devices=()):
-        noise = [torch.tensor([0.01, 1e-4])] if network.needs_noise else []
+        noise = network.noise_arguments((0.01, 1e-4))
         restored = _tried("network", name, raw, lambda: network(raw, psf, field, *noise))
         wanted = (tuple(raw.shape), network.dtype)
         if not isinstance(restored, Tensor) or (tuple(restored.shape), restored.dtype) != wanted:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.reconstruction import evaluating
-from dolens.reconstruction import Restoration
+from dolens.reconstruction import Restoration, UntrainedRestoration
 
 GRID = 64
 DEFAULT_WINDOW = 512
@@ -75,7 +75,6 @@ def margin_of(
     functions: Tensor | None,
     device: torch.device,
     largest: int = _LARGEST_PROBE,
-    noise: Sequence[Tensor] = (),
 ) -> int | None:
     """Measure how far the network looks, in pixels, as a multiple of `GRID`.
 
@@ -84,15 +83,16 @@ def margin_of(
         functions: point spread functions (D, 3, K, K), where the network asks for them.
         device: of both.
         largest: side of the largest probe image, pixels.
-        noise: of the sensor, where the network asks for it; see `Camera.noise`.
 
     Returns:
         The margin; None where the network looks farther than half the largest probe, as one does
-        that measures a whole image's brightness, or has no gradient.
+        that measures a whole image's brightness, or has no gradient to measure it by.
     """
+    if isinstance(network, UntrainedRestoration):
+        return None
     size = _FIRST_PROBE
     while size <= largest:
-        reach = _reach(network, functions, size, device, noise)
+        reach = _reach(network, functions, size, device)
         # Near the probe's edge less is seen than there would be.
         if reach < size // 2 - GRID // 2:
             return max(GRID, GRID * math.ceil(reach / GRID))
@@ -100,17 +100,8 @@ def margin_of(
     return None
 
 
-def _reach(
-    network: Restoration,
-    functions: Tensor | None,
-    size: int,
-    device: torch.device,
-    noise: Sequence[Tensor],
-) -> int:
-    """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones.
-
-    Without a gradient it is not known: all pixels.
-    """
+def _reach(network: Restoration, functions: Tensor | None, size: int, device: torch.device) -> int:
+    """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones."""
     # In double precision: rounding in a transform would look like an influence of all pixels.
     network = copy.deepcopy(network).double()
     options = {"dtype": torch.float64, "device": device}
@@ -120,9 +111,7 @@ def _reach(
     functions = None if functions is None else functions.double()
     middle, farthest = size // 2, 0
     with evaluating(network), torch.enable_grad():
-        restored = network(raw, functions, field, *noise)
-        if not restored.requires_grad:
-            return size
+        restored = network(raw, functions, field)
         for down, across in _LOOKED_AT:
             row, column = middle + down, middle + across
             (gradient,) = torch.autograd.grad(

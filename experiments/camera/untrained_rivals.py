@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.views.base import Views
-from dolens.reconstruction import Restoration, WienerBM3DRestoration, WienerTVRestoration
+from dolens.reconstruction import WienerBM3DRestoration, WienerTVRestoration
 from dolens.reconstruction.untrained import bm3d_is_installed
 
 # By what names of scores begin with, and what these restorers are called.
@@ -15,6 +15,7 @@ RIVALS = {
     "tv": "Wiener's filter and total variation, which nothing has trained",
     "bm3d": "Wiener's filter and BM3D, which nothing has trained",
 }
+_MADE = {"tv": WienerTVRestoration, "bm3d": WienerBM3DRestoration}
 
 
 def rival_names() -> list[str]:
@@ -38,11 +39,8 @@ def restored_by_rivals(
         values: of the lens's variables.
     """
     if functions is None:
-        with camera.exact():
-            functions = camera.views.point_spread_functions(camera.lens, values)
-    rivals: dict[str, Restoration] = {"tv": WienerTVRestoration()}
-    if bm3d_is_installed():
-        rivals["bm3d"] = WienerBM3DRestoration()
+        functions = camera.views.point_spread_functions(camera.lens, values)
+    rivals = {name: _MADE[name]() for name in rival_names()}
     noise = torch.tensor(camera.views.readout.noise)
     views = range(taken.raw.shape[1])
     of_view = [functions[v : v + 1] if camera.views.view_is_known else functions for v in views]

@@ -86,9 +86,7 @@ class PictureCamera:
         with torch.no_grad():
             self.values = {n: v.detach() for n, v in self.camera.variables().items()}
             self.functions = self.camera.functions(self.values)
-        self.margin = margin_of(
-            self.camera.network, self.functions, device, noise=self.camera.noise()
-        )
+        self.margin = margin_of(self.camera.network, self.functions, device)
         if self.margin is None:
             logger.warning(
                 "The network looks farther than 200 pixels around each, or one cannot tell: "

@@ -126,6 +126,6 @@ def by_photograph(values: Tensor, photographs: Sequence[str]) -> Tensor:
 
 def _pair(network: Restoration, optics: FixedOptics, split: Split, n: int) -> tuple[Tensor, Tensor]:
     raw = optics.raw(split.images[n], _TEST_SEED + n)
-    noise = [torch.tensor(optics.readout.noise)] if network.needs_noise else []
+    noise = network.noise_arguments(optics.readout.noise)
     found = network(raw, optics.functions, None, *noise).clamp(0.0, 1.0)
     return found, split.truth[n].float().expand_as(found)

@@ -9,7 +9,6 @@ import re
 from pathlib import Path
 
 import pytest
-import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
@@ -147,13 +146,7 @@ def key_is_listed(place, listed):
     )
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors are slower on several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("name", YAMLS)

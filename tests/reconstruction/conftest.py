@@ -31,12 +31,8 @@ def torch_cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def _one_thread():
-    """Networks of many small layers: threads would wait for each other more than they work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+def _one_thread(one_thread):
+    """Networks of many small layers."""
 
 
 @pytest.fixture(scope="session")

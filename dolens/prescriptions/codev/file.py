@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass, field
 
 from dolens.errors import InputError
-from dolens.prescriptions.codev.keys import MACRO, REFUSED, SURFACE, SYSTEM, WITHOUT_EFFECT
+from dolens.prescriptions.codev.keys import GROUP_OF, MACRO, REFUSED, SURFACE, SYSTEM
 from dolens.prescriptions.codev.text import Command, commands_of
 
 _NUMBERED = re.compile(r"S(O|I|S|[0-9]+)")
@@ -94,7 +94,7 @@ def parse_codev(text: str, where: str) -> CodeVFile:
         elif key in SYSTEM:
             file.system.setdefault(key, []).append(command)
         else:
-            group = next((name for name, keys in WITHOUT_EFFECT.items() if key in keys), None)
+            group = GROUP_OF.get(key)
             if group is None:
                 raise InputError(_refusal(command, place))
             file.passed_over.setdefault(group, {})[key] = None

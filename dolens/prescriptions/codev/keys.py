@@ -15,7 +15,7 @@ SURFACE = (
     *("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "XOD", "YOD", "ZOD", "DAR", "BEN", "REV"),
 )
 # What bends no ray, by what it is about; the results of solves and pick-ups are written anyway.
-WITHOUT_EFFECT = {
+_WITHOUT_EFFECT = {
     "variables, couplings and limits of an optimization": (
         *("CCY", "CCX", "THC", "GLC", "KC", "AC", "BC", "CC", "DC", "EC", "FC", "GC", "HC", "JC"),
         *("CCF", "XDC", "YDC", "ZDC", "ADC", "BDC", "CDC", "HCC", "SCC", "CUM", "THM", "PIK"),
@@ -29,6 +29,7 @@ WITHOUT_EFFECT = {
     "settings of the program": ("CA", "CWL", "CLS", "DER", "DOR", "IC", "IFO", "ACO"),
     "": ("INI", "UID", "VIE", "WID"),
 }
+GROUP_OF = {key: group for group, keys in _WITHOUT_EFFECT.items() for key in keys}
 # What bends rays and is not held: three letters → the name that optics gives it.
 REFUSED = {
     "CYL": "a cylinder",

@@ -34,6 +34,7 @@ _WITHOUT_EFFECT = {
     "expansion with temperature": ("TCE",),
     "settings of the program": ("SPE", "RAI", "RAIM", "CBK", "WARM", "AFO0", "DT"),
 }
+_GROUP_OF = {command: group for group, keys in _WITHOUT_EFFECT.items() for command in keys}
 _REFUSED = {
     "ASP": "a general aspheric surface",
     "CVX": "a second curvature, across x",
@@ -131,7 +132,7 @@ def _sort(file: OsloFile, line: Line, place: str) -> None:
     elif command in SYSTEM:
         file.system[command] = line
     else:
-        group = next((name for name, keys in _WITHOUT_EFFECT.items() if command in keys), None)
+        group = _GROUP_OF.get(command)
         if group is None:
             raise InputError(f"{place}: command {command} is not known, and may bend rays")
         file.passed_over.setdefault(group, {})[command] = None
