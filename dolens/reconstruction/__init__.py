@@ -12,6 +12,7 @@ from dolens.reconstruction.discriminators import GlobalDiscriminator, PatchDiscr
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
 from dolens.reconstruction.feature_wiener import FeatureWienerRestoration
 from dolens.reconstruction.field_coordinates import field_channels
+from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.losses import (
     RestorationLoss,
     mean_absolute_error,
@@ -44,6 +45,7 @@ __all__ = [
     "FeaturePyramid",
     "FeaturePyramidRestoration",
     "FeatureWienerRestoration",
+    "GeneralRestoration",
     "GlobalDiscriminator",
     "NAFNet",
     "NAFNetRestoration",

@@ -93,8 +93,11 @@ class NAFNet(nn.Module):
             nn.init.zeros_(self.output.bias)  # type: ignore[arg-type]  # it has one
         self.to(memory_format=torch.channels_last)  # as in `UNet`
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, image: Tensor, shift: Tensor | None = None) -> Tensor:
         """Map (B, in_channels, H, W) to (B, out_channels, H, W), for any H and W.
+
+        A `shift` (B, width, 1, 1) is added to what enters the first stage: what is known of the
+        whole image.
 
         Sides that are no multiple of `multiple` are extended by repeating the last row or column
         and the result is cropped.
@@ -102,6 +105,8 @@ class NAFNet(nn.Module):
         height, width = image.shape[-2:]
         features = functional.pixel_unshuffle(pad_to_multiple(image, self.multiple), self.fold)
         features = self.input(features)
+        if shift is not None:
+            features = features + shift
         skips: list[Tensor] = []
         for blocks, halve in zip(self.down, self.halve, strict=True):
             features = blocks(features)
