@@ -28,24 +28,33 @@ _COLUMNS = ("split", "package", "version", "path", "sha256", "title")
 _XDG_DEFAULT = "/usr/local/share/:/usr/share/"
 
 
-@dataclass(frozen=True)
-class Entry:
-    """An `Entry` is a photograph of a manifest.
+@dataclass(frozen=True, kw_only=True)
+class PackagedPhotograph:
+    """A `PackagedPhotograph` is a photograph that a package brings.
 
     Attributes:
-        split: `train`, `validation` or `test`.
         package: the Debian package that brings it.
         version: of the package, where the file was taken from.
         path: of the file, relative to a folder of shared data.
-        sha256: of the file, hexadecimal.
-        title: a few words on what it shows.
+        sha256: of the photograph's bytes, hexadecimal.
     """
 
-    split: Split
     package: str
     version: str
     path: str
     sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry(PackagedPhotograph):
+    """An `Entry` is a photograph of a manifest, in a file of its own.
+
+    Attributes:
+        split: `train`, `validation` or `test`.
+        title: a few words on what it shows.
+    """
+
+    split: Split
     title: str
 
 
@@ -137,6 +146,19 @@ def find_files(entries: Sequence[Entry], folders: Sequence[Path]) -> list[Path]:
     Raises:
         InputError: files are missing, or one is not the file that was listed.
     """
+    files = locate(entries, folders)
+    for entry, file in zip(entries, files, strict=True):
+        with file.open("rb") as content:
+            check_hash(entry, file, hashlib.file_digest(content, "sha256").hexdigest())
+    return files
+
+
+def locate(entries: Sequence[PackagedPhotograph], folders: Sequence[Path]) -> list[Path]:
+    """Find the files that hold photographs, each in the first folder that has it.
+
+    Raises:
+        InputError: files are missing; the line names the packages that bring them.
+    """
     files = [_first(entry, folders) for entry in entries]
     missing = [entry for entry, file in zip(entries, files, strict=True) if file is None]
     if missing:
@@ -146,30 +168,58 @@ def find_files(entries: Sequence[Entry], folders: Sequence[Path]) -> list[Path]:
             f"{', '.join(map(str, folders))}; install the Debian packages {' '.join(packages)}, or "
             "unpack them and name their usr/share in data.folders"
         )
-    for entry, file in zip(entries, files, strict=True):
-        with file.open("rb") as content:
-            if hashlib.file_digest(content, "sha256").hexdigest() != entry.sha256:
-                raise InputError(
-                    f"{file}: not the file that the manifest lists (SHA-256 differs); install the "
-                    f"Debian package {entry.package}, version {entry.version}"
-                )
-    return files
+    return [file for file in files if file is not None]
+
+
+def check_hash(entry: PackagedPhotograph, file: Path, sha256: str) -> None:
+    """Check that the bytes found in a file have the hash that is listed.
+
+    Raises:
+        InputError: they have another.
+    """
+    if sha256 != entry.sha256:
+        raise InputError(
+            f"{file}: not the file that the manifest lists (SHA-256 differs); install the "
+            f"Debian package {entry.package}, version {entry.version}"
+        )
 
 
 def shrunk(photograph: Photograph, least: int) -> Photograph:
-    """Average a photograph over k×k pixels in linear light; incomplete last rows and columns are
-    dropped.
+    """Average a photograph over k×k pixels in linear light; see `averaged`.
 
     Args:
         photograph: without depth.
         least: pixels that the longer side keeps; k is the largest whole number that leaves them.
     """
-    factor = max(photograph.height, photograph.width) // least
+    return averaged(photograph, max(photograph.height, photograph.width) // least)
+
+
+def averaged(photograph: Photograph, factor: int) -> Photograph:
+    """Average a photograph over factor×factor pixels in linear light; incomplete last rows and
+    columns are dropped.
+
+    Args:
+        photograph: without depth; it is returned as it is where it is smaller than that.
+        factor: pixels of the photograph to a pixel of the average, along each side.
+    """
     if factor <= 1 or min(photograph.height, photograph.width) < factor:
         return photograph
     light = torch.cat([avg_pool2d(linear_light(band[None]), factor) for band in photograph.encoded])
     encoded = (linear_to_srgb(light) * 255.0).round().to(torch.uint8)
     return Photograph(photograph.name, encoded)
+
+
+def check_inside(manifest: Path, line: int, path: str) -> None:
+    """Check that a path of a manifest stays within a folder.
+
+    Raises:
+        InputError: it is absolute, empty, or goes up.
+    """
+    inside = PurePosixPath(path)
+    if inside.is_absolute() or ".." in inside.parts or not inside.parts:
+        raise InputError(
+            f"{manifest}, line {line}: path '{path}'; allowed: one within a folder of shared data"
+        )
 
 
 def _entry(path: Path, line: int, row: dict[str, str]) -> Entry:
@@ -180,13 +230,9 @@ def _entry(path: Path, line: int, row: dict[str, str]) -> Entry:
         raise InputError(
             f"{path}, line {line}: split '{entry.split}'; allowed: {', '.join(get_args(Split))}"
         )
-    inside = PurePosixPath(entry.path)
-    if inside.is_absolute() or ".." in inside.parts or not inside.parts:
-        raise InputError(
-            f"{path}, line {line}: path '{entry.path}'; allowed: one within a folder of shared data"
-        )
+    check_inside(path, line, entry.path)
     return entry
 
 
-def _first(entry: Entry, folders: Sequence[Path]) -> Path | None:
+def _first(entry: PackagedPhotograph, folders: Sequence[Path]) -> Path | None:
     return next((f / entry.path for f in folders if os.path.isfile(f / entry.path)), None)
