@@ -86,7 +86,7 @@ def field_point_spread_functions(
     places = _places(points, among, system.rotationally_symmetric)
     disc = sampled_disc(places, pupil_samples, seed, system)
     seen = plane_points(imaging, points, disc)
-    centre = (chief_ray_points if distortion else pinhole_points)(imaging, points)
+    centre = _centres(imaging, points, distortion)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
     return splat_plane_points(
         PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
@@ -123,7 +123,7 @@ def wave_point_spread_functions(
     finely diffraction is computed.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
-    places = _object_points(imaging, points, distortion)
+    places = object_points(imaging, points, _centres(imaging, points, distortion))
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
     kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
     kernels = kernels.reshape(*shape, size, size)
@@ -147,19 +147,36 @@ def wave_cost(
         Samples along each side of a pupil by Fourier transform, and why one of them needs direct
         integration, which takes a thousand times as long; None where none does.
     """
-    places = _object_points(imaging, points, distortion)
+    places = object_points(imaging, points, _centres(imaging, points, distortion))
     found = propagation(imaging.system, *places, PixelWindow(imaging.sensor.pixel_pitch, size))
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
     return found.samples, next(direct, None)
 
 
-def _object_points(
+def _centres(
     imaging: ImagingSystem, points: tuple[Tensor, Tensor], distortion: bool
+) -> tuple[Tensor, Tensor]:
+    """Rows and columns (N, D, C) of the scene's points that functions are centred on."""
+    return (chief_ray_points if distortion else pinhole_points)(imaging, points)
+
+
+def object_points(
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], centre: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
+    """Return what `wave_kernels` takes for functions about points of the sensor.
+
+    Args:
+        imaging: the lens, D depths and C wavelengths, and the pixels' pitch.
+        points: x and y on the sensor, mm, each (N,).
+        centre: rows and columns of the scene's points that light comes from, each (N, D, C or 1),
+            as `chief_ray_points` has them.
+
+    Returns:
+        Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm.
+    """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     planes, channels = len(scene.depths), len(scene.wavelengths)
-    rows, columns = (chief_ray_points if distortion else pinhole_points)(imaging, points)
+    rows, columns = centre
     options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
     magnifications = scene.differentiable_magnifications(system)

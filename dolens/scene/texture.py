@@ -54,3 +54,12 @@ def texture_coordinates(
     scale = magnification / pitch
     row, column = origin
     return row - y * scale, column + x * scale
+
+
+def resized(picture: Tensor, height: int, width: int) -> Tensor:
+    """Return a picture (3, h, w) in linear light at another size, as crops of photographs are."""
+    if picture.shape[-2:] == (height, width):
+        return picture
+    size = (height, width)
+    found = functional.interpolate(picture[None], size, mode="bicubic", antialias=True)
+    return found[0].clamp(0.0, 1.0)

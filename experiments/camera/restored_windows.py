@@ -19,6 +19,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.reconstruction import Restoration, UntrainedRestoration
+from dolens.reconstruction.whole_pictures import mirrored
 
 GRID = 64
 DEFAULT_WINDOW = 512
@@ -58,16 +59,6 @@ def windows(height: int, width: int, window: int) -> Iterator[Window]:
 
 def _stretches(length: int, window: int) -> list[tuple[int, int]]:
     return [(start, min(start + window, length)) for start in range(0, length, window)]
-
-
-def _mirrored(stretch: tuple[int, int], margin: int, length: int, device: torch.device) -> Tensor:
-    """Indices of a stretch and its margins; beyond the ends the mirror image goes on."""
-    if length == 1:
-        return torch.zeros(stretch[1] - stretch[0] + 2 * margin, dtype=torch.long, device=device)
-    index = torch.arange(stretch[0] - margin, stretch[1] + margin, device=device)
-    period = 2 * (length - 1)
-    folded = index.remainder(period)
-    return torch.where(folded < length, folded, period - folded)
 
 
 def margin_of(
@@ -171,8 +162,9 @@ def restore_in_windows(
         found = torch.empty(raw.shape, dtype=network.dtype, device=raw.device)
         inner = slice(margin, -margin)
         for part in windows(height, width, window):
-            rows = _mirrored(part.rows, margin, height, raw.device)
-            columns = _mirrored(part.columns, margin, width, raw.device)
+            (top, bottom), (left, right) = part.rows, part.columns
+            rows = mirrored(top - margin, bottom + margin, height, raw.device)
+            columns = mirrored(left - margin, right + margin, width, raw.device)
             seen = (..., rows[:, None], columns)
             places = None if field is None else field[seen]
             restored = network(raw[seen], functions, places, *noise)

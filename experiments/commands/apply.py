@@ -1,22 +1,29 @@
 """A finished run's camera on a user's own pictures: what its sensor sees, and what is restored."""
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.restored_windows import (
+    DEFAULT_WINDOW,
     margin_of,
     restore_in_windows,
 )
 from dolens.experiments.camera.views.whole import Placing
+from dolens.experiments.commands.applied import (
+    Applied,
+    apply_to_files,
+    check_files,
+    check_size,
+    names_at_depths,
+    written,
+)
 from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.picture_files import (
     read_array,
@@ -25,37 +32,10 @@ from dolens.experiments.commands.picture_files import (
 )
 from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import FinishedRun, load_run
-from dolens.experiments.running.run_files import write_json
 from dolens.experiments.running.trust import own_folder
-from dolens.plotting import save_figure
-from dolens.plotting.applied_picture import applied_figure
-from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
-from dolens.sensor.image_files import format_of
 
 logger = logging.getLogger(__name__)
-
-_SMALLEST = 16
-# Copies of a picture that are held at once, float32 of three channels; and a warning from there on.
-_COPIES, _MUCH_MEMORY = 12, 4e9
-
-
-@dataclass(frozen=True)
-class Applied:
-    """What became of one picture at one depth.
-
-    Attributes:
-        name: of the picture, with its depth where there are several.
-        files: that were written.
-        metrics: PSNR and SSIM of the sensor's image (`raw_…`) and of the restored one; empty where
-            there is no truth.
-        mapping: how the picture came to lie on the sensor, in words.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    metrics: Mapping[str, float]
-    mapping: str
 
 
 class PictureCamera:
@@ -93,6 +73,11 @@ class PictureCamera:
                 "pictures are restored as a whole"
             )
 
+    @property
+    def window(self) -> int:
+        """Pixels along each side of what is restored at once."""
+        return self.options.window or DEFAULT_WINDOW
+
     def depths(self) -> list[float]:
         """The depths that pictures are put at, mm."""
         return list(self.options.depths) or [self.camera.views.scene.middle_depth]
@@ -106,10 +91,8 @@ class PictureCamera:
         picture = read_picture(file, self.options.megapixels)
         for note in picture.notes:
             logger.warning("%s: %s", file, note)
-        _check_size(file, picture.linear.shape[-2:])
-        names = {depth: picture.name for depth in self.depths()}
-        if len(names) > 1:
-            names = {depth: f"{picture.name}_{_label(depth)}" for depth in names}
+        check_size(file, picture.linear.shape[-2:])
+        names = names_at_depths(picture.name, self.depths())
         return [
             self._at_depth(picture.linear, depth, name, folder) for depth, name in names.items()
         ]
@@ -122,26 +105,13 @@ class PictureCamera:
         with torch.no_grad():
             signal = views.readout(taken.image, generator)
             raw = views.readout.develop(signal)
-        restored = self._restored(raw, taken.field)
-        sensor = linear_to_srgb(raw)
-        metrics = _metrics(taken.truth, sensor, restored)
-        metrics |= {"depth_mm": float(depth)}
-        files = [
-            self._written(folder, f"{name}_sensor", sensor[0]),
-            self._written(folder, f"{name}_restored", restored[0]),
-        ]
-        if options.save_raw:
-            path = folder / f"{name}_raw.npy"
-            np.save(path, signal[0].permute(1, 2, 0).squeeze(-1).float().cpu().numpy())
-            files.append(path)
-        figure = applied_figure(
-            {"truth": taken.truth[0], "sensor": sensor[0], "restored": restored[0]},
-            {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]},
-            f"{name.removesuffix(f'_{_label(depth)}')} at {depth / 1000.0:g} m",
-        )
-        save_figure(figure, folder / f"{name}_comparison.png")
-        files.append(folder / f"{name}_comparison.png")
-        return Applied(name, tuple(files), metrics, taken.mapping)
+        images = {
+            "truth": taken.truth[0],
+            "sensor": linear_to_srgb(raw)[0],
+            "restored": self._restored(raw, taken.field)[0],
+        }
+        files, metrics = written(images, signal[0], depth, name, folder, options)
+        return Applied(name, files, metrics, taken.mapping)
 
     def restore(self, file: Path, folder: Path) -> list[Applied]:
         """Restore what a real sensor of this camera gave, and write the picture into a folder.
@@ -150,13 +120,14 @@ class PictureCamera:
             InputError: the file cannot be read, or has other channels than the run's sensor.
         """
         array = read_array(file, self.options.megapixels)
-        _check_size(file, array.shape[:2])
+        check_size(file, array.shape[:2])
         readout = self.camera.views.readout
         signal = signal_of(array, readout, file, self.options.black_level, self.options.white_level)
         raw = readout.develop(signal.to(self.device))
         field = self.camera.views.field_of(*raw.shape[-2:])
         restored = self._restored(raw, None if field is None else field[None].to(raw))
-        path = self._written(folder, f"{file.stem}_restored", restored[0])
+        path = folder / f"{file.stem}_restored.{self.options.format}"
+        write_picture(path, restored[0], self.options.bits)
         mapping = f"{raw.shape[-1]}×{raw.shape[-2]} raw pixels, taken from the middle of the sensor"
         return [Applied(file.stem, (path,), {}, mapping)]
 
@@ -166,16 +137,25 @@ class PictureCamera:
             raw,
             self.functions,
             field,
-            self.options.window,
+            self.window,
             self.margin,
             self.camera.noise(),
         )
         return found.clamp(0.0, 1.0)
 
-    def _written(self, folder: Path, name: str, encoded: Tensor) -> Path:
-        path = folder / f"{name}.{self.options.format}"
-        write_picture(path, encoded, self.options.bits)
-        return path
+    def record(self) -> dict[str, Any]:
+        """Return what is true of all pictures, for their records."""
+        run, options = self.run, self.options
+        return {
+            "run": str(run.folder),
+            "experiment": run.experiment,
+            "checkpoint": str(run.checkpoint),
+            "step": run.step,
+            "seed": options.seed,
+            "raw": options.raw,
+            "window": self.window,
+            "margin": self.margin,
+        }
 
 
 def apply_run(
@@ -207,73 +187,9 @@ def apply_run(
     Raises:
         InputError: the run, an option or a file cannot be used.
     """
-    stems = [Path(file).stem for file in files]
-    for file in files:
-        format_of(Path(file).expanduser())
-    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
-    if twice is not None:
-        raise InputError(f"{twice}: two pictures of this name would write the same files")
+    check_files(files)
     into = own_folder(folder, "applied") if out is None else Path(out).expanduser().resolve()
     run = load_run(folder, checkpoint, with_loss=False, trust=trust)
     camera = PictureCamera(run, options)
-    try:
-        into.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"--out: {into}: no folder can be made here ({reason})") from None
-    found = []
-    for file in files:
-        each = camera.restore if options.raw else camera.apply
-        applied = each(Path(file).expanduser(), into)
-        found += applied
-        write_json(into / f"{Path(file).stem}.json", _record(camera, file, applied))
-    return into, camera, found
-
-
-def _metrics(truth: Tensor, sensor: Tensor, restored: Tensor) -> dict[str, float]:
-    truth = truth.to(restored)
-    found = {}
-    for prefix, image in (("raw_", sensor.to(restored)), ("", restored)):
-        found[f"{prefix}psnr_db"] = float(psnr_db(image, truth))
-        found[f"{prefix}ssim"] = float(structural_similarity(image, truth))
-    return found
-
-
-def _record(camera: PictureCamera, file: str | Path, applied: Sequence[Applied]) -> dict[str, Any]:
-    run, options = camera.run, camera.options
-    return {
-        "picture": str(file),
-        "run": str(run.folder),
-        "experiment": run.experiment,
-        "checkpoint": str(run.checkpoint),
-        "step": run.step,
-        "seed": options.seed,
-        "raw": options.raw,
-        "window": options.window,
-        "margin": camera.margin,
-        "images": {
-            entry.name: {
-                "mapping": entry.mapping,
-                "files": [path.name for path in entry.files],
-                **entry.metrics,
-            }
-            for entry in applied
-        },
-    }
-
-
-def _check_size(file: Path, size: Sequence[int]) -> None:
-    height, width = size
-    if min(height, width) < _SMALLEST:
-        raise InputError(
-            f"{file}: {width}×{height} pixels; allowed: {_SMALLEST} or more along each side"
-        )
-    memory = 4.0 * 3 * height * width * _COPIES
-    if memory > _MUCH_MEMORY:
-        logger.warning(
-            "%s: %d×%d pixels take about %.0f GB of memory", file, width, height, memory / 1e9
-        )
-
-
-def _label(depth: float) -> str:
-    return f"{depth / 1000.0:g}m"
+    each = camera.restore if options.raw else camera.apply
+    return into, camera, apply_to_files(files, into, each, camera.record)

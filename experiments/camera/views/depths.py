@@ -22,7 +22,6 @@ from dolens.experiments.camera.views.whole import (
     axial_function,
     convolved,
     diffraction_of,
-    resized,
 )
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
@@ -32,6 +31,7 @@ from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene
+from dolens.scene.texture import resized
 from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout

@@ -25,7 +25,6 @@ from dolens.experiments.camera.views.whole import (
     WholePicture,
     at_depth,
     diffraction_of,
-    resized,
 )
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
@@ -40,6 +39,7 @@ from dolens.rendering.protocol import (
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.scene.texture import resized
 from dolens.seeded_generators import generator_of
 from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.colour import linear_to_srgb

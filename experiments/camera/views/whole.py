@@ -85,15 +85,6 @@ def at_depth(scene: Scene, depth: float, lens: Lens) -> Scene:
     return scene
 
 
-def resized(picture: Tensor, height: int, width: int) -> Tensor:
-    """Return a picture (3, h, w) in linear light at another size, as crops of photographs are."""
-    if picture.shape[-2:] == (height, width):
-        return picture
-    size = (height, width)
-    found = functional.interpolate(picture[None], size, mode="bicubic", antialias=True)
-    return found[0].clamp(0.0, 1.0)
-
-
 def diffraction_of(renderer: Renderer) -> str:
     """Return how a renderer models diffraction: `none`, `limit` or `wave`."""
     if isinstance(renderer, AutoRenderer) and renderer.choice is not None:

@@ -1,0 +1,163 @@
+"""What a camera made of pictures is measured, written and recorded, whatever the camera."""
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.experiments.commands.apply_options import PictureOptions
+from dolens.experiments.commands.picture_files import write_picture
+from dolens.experiments.running.run_files import write_json
+from dolens.plotting import save_figure
+from dolens.plotting.applied_picture import applied_figure
+from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.sensor.image_files import format_of
+
+logger = logging.getLogger(__name__)
+
+_SMALLEST = 16
+# Copies of a picture that are held at once, float32 of three channels; and a warning from there on.
+_COPIES, _MUCH_MEMORY = 12, 4e9
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What became of one picture at one depth.
+
+    Attributes:
+        name: of the picture, with its depth where there are several.
+        files: that were written.
+        metrics: PSNR and SSIM of the sensor's image (`raw_…`) and of the restored one; empty where
+            there is no truth.
+        mapping: how the picture came to lie on the sensor, in words.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    metrics: Mapping[str, float]
+    mapping: str
+
+
+def apply_to_files(
+    files: Sequence[str | Path],
+    into: Path,
+    each: Callable[[Path, Path], list[Applied]],
+    record: Callable[[], dict[str, Any]],
+) -> list[Applied]:
+    """Apply a camera to files, and write beside the images what became of each.
+
+    Args:
+        files: of the pictures.
+        into: the folder that is written to; it is made.
+        each: of a file and that folder: what a camera makes of it.
+        record: what is true of all of them, for the record.
+
+    Raises:
+        InputError: the folder cannot be made, or a file not be used.
+    """
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"--out: {into}: no folder can be made here ({reason})") from None
+    found = []
+    for file in files:
+        applied = each(Path(file).expanduser(), into)
+        found += applied
+        images = {
+            entry.name: {
+                "mapping": entry.mapping,
+                "files": [path.name for path in entry.files],
+                # JSON has no infinity, as a depth may be.
+                **{n: v if math.isfinite(v) else None for n, v in entry.metrics.items()},
+            }
+            for entry in applied
+        }
+        write_json(
+            into / f"{Path(file).stem}.json", {"picture": str(file), "images": images, **record()}
+        )
+    return found
+
+
+def check_files(files: Sequence[str | Path]) -> None:
+    """Refuse files that are missing or no pictures, or that would write the same ones.
+
+    Raises:
+        InputError: the line names the file.
+    """
+    stems = [Path(file).stem for file in files]
+    for file in files:
+        format_of(Path(file).expanduser())
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise InputError(f"{twice}: two pictures of this name would write the same files")
+
+
+def check_size(file: Path, size: Sequence[int]) -> None:
+    """Refuse a picture (height, width) that is too small, and warn of one that is very large."""
+    height, width = size
+    if min(height, width) < _SMALLEST:
+        raise InputError(
+            f"{file}: {width}×{height} pixels; allowed: {_SMALLEST} or more along each side"
+        )
+    memory = 4.0 * 3 * height * width * _COPIES
+    if memory > _MUCH_MEMORY:
+        logger.warning(
+            "%s: %d×%d pixels take about %.0f GB of memory", file, width, height, memory / 1e9
+        )
+
+
+def names_at_depths(name: str, depths: Sequence[float]) -> dict[float, str]:
+    """Return what a picture is called at each depth: by its own name where there is one."""
+    if len(set(depths)) == 1:
+        return dict.fromkeys(depths, name)
+    return {depth: f"{name}_{label(depth)}" for depth in depths}
+
+
+def label(depth: float) -> str:
+    """Return a depth (mm) in metres, as names of files have it: `6m`, `infm` of infinity."""
+    return f"{depth / 1000.0:g}m"
+
+
+def written(
+    images: Mapping[str, Tensor],
+    signal: Tensor,
+    depth: float,
+    name: str,
+    folder: Path,
+    options: PictureOptions,
+) -> tuple[tuple[Path, ...], dict[str, float]]:
+    """Measure and write what a camera makes of a picture.
+
+    Args:
+        images: truth, sensor and restored, each (3, H, W), display-encoded.
+        signal: what the sensor gave, (1 or 3, H, W).
+        depth: of the picture, mm.
+        name: that files begin with.
+        folder: that they are written to.
+        options: bits and format.
+
+    Returns:
+        The files, and PSNR and SSIM.
+    """
+    truth, files, metrics = images["truth"], [], {"depth_mm": float(depth)}
+    for kind, prefix in (("sensor", "raw_"), ("restored", "")):
+        image = images[kind]
+        metrics[f"{prefix}psnr_db"] = float(psnr_db(image[None], truth[None].to(image)))
+        metrics[f"{prefix}ssim"] = float(structural_similarity(image[None], truth[None].to(image)))
+        files.append(folder / f"{name}_{kind}.{options.format}")
+        write_picture(files[-1], image, options.bits)
+    if options.save_raw:
+        files.append(folder / f"{name}_raw.npy")
+        np.save(files[-1], signal.permute(1, 2, 0).squeeze(-1).float().cpu().numpy())
+    title = f"{name.removesuffix(f'_{label(depth)}')} at {depth / 1000.0:g} m"
+    numbers = {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]}
+    files.append(folder / f"{name}_comparison.png")
+    save_figure(applied_figure(images, numbers, title), files[-1])
+    return tuple(files), metrics
