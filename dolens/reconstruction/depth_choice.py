@@ -3,9 +3,9 @@
 An image of light of spectrum S through transfer H_d has the spectrum S·|H_d|² + N, N being the
 noise's.  A filter of one over its root makes it white where the depth is right, so that the
 Gaussian log-likelihood of a neighbourhood is -½ (mean e² + mean log(S·|H_d|² + N)) for each of its
-values, e being the filtered image (Levin et al., ACM Trans. Graph. 26, 70, 2007; Zhu et al., IEEE Trans. Image
-Process. 22, 4879, 2013).  Contrast and softness of what is there are unknown: S is the best of
-several.
+values, e being the filtered image (Levin et al., ACM Trans. Graph. 26, 70, 2007; Zhu et al., IEEE
+Trans. Image Process. 22, 4879, 2013).  Contrast and softness of what is there are unknown: S is the
+best of several.
 """
 
 import math

@@ -200,6 +200,7 @@ class GeneralRestoration(Restoration):
         weights: "package" for those that dolens brings, "none" to begin at random, or the path of a
             file that `save_weights` has written.
         by_depth: whether functions are those of depths that places of an image may have.
+        held: whether the weights stay as they are, while a lens is learned through them.
 
     Rarely needed, as the trained weights are of these widths:
         width: channels of the NAFNet's first stage.
@@ -218,6 +219,7 @@ class GeneralRestoration(Restoration):
         self,
         weights: str = "package",
         by_depth: bool = False,
+        held: bool = False,
         width: int = 32,
         down: Sequence[int] = (2, 2, 2),
         middle: int = 3,
@@ -239,6 +241,7 @@ class GeneralRestoration(Restoration):
         self.pretrained = weights != "none"
         if self.pretrained:
             self.load_weights(WEIGHTS if weights == "package" else Path(weights))
+        self.requires_grad_(not held)
 
     def load_weights(self, file: Path) -> None:
         """Take the weights of a file, which is read as data.

@@ -1,0 +1,1 @@
+"""A restorer is trained once for all lenses."""
