@@ -1,4 +1,4 @@
-"""Where the depth of a scene is unknown, its likelihood at each place chooses among functions.
+"""The likelihood of each depth at each place chooses among the point spread functions of several.
 
 An image of light of spectrum S through transfer H_d has the spectrum S·|H_d|² + N, N being the
 noise's.  A filter of one over its root makes it white where the depth is right, so that the

@@ -34,7 +34,6 @@ from dolens.reconstruction.wiener import (
     transfer_function,
 )
 from dolens.sensor.colour import linear_to_srgb
-from dolens.whole_files import written_whole
 
 # Noise over signal power, as those of `UntrainedRestoration`, of the three filters.
 _RATIOS = ((0.1, 0.7, 2.0), (0.4, 2.8, 8.0), (1.6, 11.2, 32.0))
@@ -55,7 +54,9 @@ WEIGHTS = Path(__file__).with_suffix(".pt")
 
 
 class Stabiliser(NamedTuple):
-    """Maps light x to y = (√(x + c) - √c)/(√(1 + c) - √c), whose noise is even, and back.
+    """A `Stabiliser` maps light to values whose noise is even, and back.
+
+        y = (√(x + c) - √c)/(√(1 + c) - √c)
 
     With shot noise a·x and read noise b the constant is c = b/a + 3a/8; black stays 0 and white 1.
 
@@ -86,7 +87,7 @@ class Stabiliser(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What the network of a `GeneralRestoration` is given.
+    """A `Prepared` holds the input of the network of a `GeneralRestoration`.
 
     Attributes:
         images: stabilised: the sensor's, then those of the three filters, (B, 12, H, W).
@@ -262,8 +263,7 @@ class GeneralRestoration(Restoration):
 
     def save_weights(self, file: Path) -> None:
         """Write the weights in half precision, whose rounding is far below the noise."""
-        with written_whole(file) as aside:
-            torch.save({name: value.half() for name, value in self.state_dict().items()}, aside)
+        torch.save({name: value.half() for name, value in self.state_dict().items()}, file)
 
     def forward(
         self,

@@ -1,6 +1,7 @@
 """Photographs and lenses that a restorer of any lens is trained with."""
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,10 @@ from torch.utils.data import DataLoader
 
 from dolens.experiments.checks import check_count
 from dolens.experiments.data.package_photographs import PackagePhotographsDataModule
-from dolens.experiments.data.pretraining_photographs import pretraining_photographs
+from dolens.experiments.data.pretraining_photographs import (
+    PRETRAINING_MANIFEST,
+    pretraining_photographs,
+)
 from dolens.experiments.data.resumable import ResumableSampler
 from dolens.experiments.pretraining.examples import Draws, Example, Examples
 from dolens.experiments.pretraining.functions import function_bank
@@ -32,6 +36,7 @@ class PretrainingDataModule(PackagePhotographsDataModule):
     Args:
         lenses: cameras whose point spread functions are drawn at first.
         draws: how examples are drawn from them.
+        further: a list of more photographs, see `pretraining_photographs`; None: the project's own.
         **photographs: the arguments of `PackagePhotographsDataModule`; its crop size, scales and
             flips are of validation and test alone.
 
@@ -39,9 +44,12 @@ class PretrainingDataModule(PackagePhotographsDataModule):
         InputError: an argument out of range; at set-up, a file that is missing or altered.
     """
 
-    def __init__(self, lenses: int, draws: Draws, **photographs: Any) -> None:
+    def __init__(
+        self, lenses: int, draws: Draws, further: str | None = None, **photographs: Any
+    ) -> None:
         super().__init__(**photographs)
         check_count("data.lenses", lenses)
+        self.further = PRETRAINING_MANIFEST if further is None else Path(further)
         self.lenses, self.draws = lenses, draws
         self.examples: Examples | None = None
 
@@ -50,7 +58,8 @@ class PretrainingDataModule(PackagePhotographsDataModule):
         super().setup(stage)
         if stage == "fit" and self.examples is None:
             pictures = [(p.encoded, 1.0) for p in self.photographs("train")]
-            pictures += [(p.encoded, w) for p, w in pretraining_photographs(self.folders)]
+            further = pretraining_photographs(self.folders, self.further)
+            pictures += [(photograph.encoded, weight) for photograph, weight in further]
             pictures += [(p, _DRAWN_WEIGHT) for p in _drawn(self.seed)]
             logger.info("%d pictures; drawing %d lenses", len(pictures), self.lenses)
             images, weights = zip(*pictures, strict=True)

@@ -1,13 +1,19 @@
 """Examples for a restorer of any lens are images as sensors give them, and follow from a number."""
 
+import csv
+import hashlib
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from tiny_experiment import TINY
 
 from dolens.experiments.pretraining.examples import Draws, Examples
 from dolens.experiments.pretraining.textures import dead_leaves, text
+from dolens.experiments.running.training import run
 from dolens.reconstruction.general import Stabiliser
 from dolens.sensor.colour import srgb_to_linear
 
@@ -101,3 +107,85 @@ def test_drawn_pictures_have_edges_and_follow_from_the_generator(draw):
     steps = picture.float().diff(dim=-1).abs()
     assert float(steps.max()) > 60.0
     assert float(steps.median()) < 3.0
+
+
+def listed(folder, columns, rows):
+    """A list of photographs, and the photographs."""
+    folder.mkdir(exist_ok=True)
+    file = folder / f"list_{columns[0]}.csv"
+    with file.open("w", newline="", encoding="utf-8") as target:
+        csv.writer(target).writerows([columns, *rows])
+    return file
+
+
+def picture(folder, name, seed):
+    """The hash of a drawn picture that is written there."""
+    pixels = dead_leaves(np.random.default_rng(seed), 96).permute(1, 2, 0).numpy()
+    Image.fromarray(pixels).save(folder / name)
+    return hashlib.sha256((folder / name).read_bytes()).hexdigest()
+
+
+def settings(folder):
+    """An experiment that ends in seconds, with photographs of its own."""
+    folder.mkdir(exist_ok=True)
+    splits = ("train", "validation", "test")
+    hashes = [picture(folder, f"{split}.png", n) for n, split in enumerate(splits)]
+    rows = [[s, "own", "1", f"{s}.png", h, s] for s, h in zip(splits, hashes, strict=True)]
+    columns = ["split", "package", "version", "path", "sha256", "title"]
+    more = ["package", "version", "path", "member", "offset", "length"]
+    more += ["sha256", "licence", "shrink", "weight"]
+    further = ["own", "1", "more.png", "", "", "", picture(folder, "more.png", 9), "MIT", 1, 0.5]
+    return [
+        "experiment=pretrain_restoration",
+        *TINY,
+        f"data.manifest={listed(folder, columns, rows)}",
+        f"data.further={listed(folder, more, [further])}",
+        f"data.folders=[{folder}]",
+        "+data.scikit_image=[]",
+        "data.lenses=2",
+        "data.draws.cameras=1",
+        "data.draws.crops=1",
+        "data.draws.side=32",
+        "data.num_workers=0",
+        "trainer.check_val_every_n_epoch=1",
+        "trainer.precision=32-true",
+        "scheduler.T_max=100",  # of a run that ends sooner too
+        "network.width=8",
+        "network.down=[1]",
+        "network.middle=1",
+        "network.up=[1]",
+    ]
+
+
+def test_a_resumed_training_is_the_same_to_the_bit(composed, tmp_path):
+    own = settings(tmp_path / "photographs")
+    whole = run(composed(*own, folder="whole"))
+    run(composed(*own, "trainer.max_epochs=1", folder="begun"))
+    begun = tmp_path / "begun" / "checkpoints" / "last.ckpt"
+    resumed = run(composed(*own, f"ckpt_path={begun}", folder="resumed"))
+    assert resumed == whole
+    states = [
+        torch.load(tmp_path / name / "checkpoints" / "last.ckpt", weights_only=True)
+        for name in ("whole", "resumed")
+    ]
+    assert states[0]["global_step"] == states[1]["global_step"] == 4
+    for name in ("state_dict", "current_model_state"):
+        first, second = (state[name] for state in states)
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[key], second[key]) for key in first)
+    metrics = json.loads((tmp_path / "whole" / "metrics.json").read_text())
+    assert metrics["test/photographs"] == 1.0
+    assert "test/tv_psnr_db/worst" in metrics
+
+
+@pytest.mark.parametrize(
+    ("expected", "overrides"),
+    [
+        ("network: UNetRestoration; allowed for pretraining: general", ["network=unet"]),
+        ("variables: allowed for pretraining: null", ["variables={sensor_distance: {scale: 0.2}}"]),
+        ("data.lenses", ["data.lenses=0"]),
+        ("network.weights", ["network.weights=nowhere.pt"]),
+    ],
+)
+def test_wrong_settings_are_named(refused, expected, overrides):
+    refused(expected, "experiment=pretrain_restoration", *overrides)
