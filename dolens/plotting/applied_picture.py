@@ -28,7 +28,7 @@ def applied_figure(
         psnr: name → dB, for titles.
         title: of the figure.
     """
-    images = {name: image.detach().cpu().float().clamp(0, 1) for name, image in images.items()}
+    images = {name: image.detach().cpu() for name, image in images.items()}
     first = next(iter(images.values()))
     height, width = first.shape[-2:]
     side = min(_PART, height, width)
@@ -79,4 +79,4 @@ def _shrunk(image: Tensor) -> Tensor:
 
 
 def _pixels(image: Tensor) -> object:
-    return image.permute(1, 2, 0).numpy()
+    return image.float().clamp(0.0, 1.0).permute(1, 2, 0).numpy()

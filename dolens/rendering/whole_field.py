@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.diffraction.pixel_integration import PixelWindow
@@ -54,9 +55,9 @@ _DARK = 1e-3
 # Strata of the pupil along each side, at least, for functions by which pictures are restored.
 _SAMPLES = 48
 # Sides of windows that one function may serve, pixels, and RMS grey levels that it may be off
-# within one: by so much, restored pictures are off in bright light, and by less in noise.
-_WINDOWS, _OFF = (512, 256), 1.5
-_NARROWEST = 128
+# within one: by so much, restored pictures are off in bright light, and by less in noise.  Smaller
+# windows than the last are not worth their margins, nor are those that functions are wider than.
+_WINDOWS, _OFF = (512, 256, 128), 1.5
 # Points at which functions are compared, and their distance from a window's middle over its side,
 # down and across: that of its pixels, root mean square.
 _COMPARED, _AWAY = 16, 0.29
@@ -215,14 +216,26 @@ class WholeField:
     def truth(self, texture: Tensor, depth: int = 0) -> Tensor:
         """Return what an ideal lens of the same distortion, without lateral colour, would have
         imaged: (3, height, width), linear light.
+
+        Between texels it is bicubic: what restorers undo, a pixel's box and a texel's tent, is in
+        the functions already, and lookup by a tent would blur it once more.
         """
+        height, width = texture.shape[-2:]
+        row, column = texture_origin((height, width), (0.0, 0.0))
         image = texture.new_empty(3, self.sensor.height, self.sensor.width)
-        row, column = texture_origin((texture.shape[-2], texture.shape[-1]), (0.0, 0.0))
-        for top, left, height, width in self.cells():
-            window = self.sensor.window(top, left, height + 1, width + 1)
+        for top, left, rows, columns in self.cells():
+            window = self.sensor.window(top, left, rows + 1, columns + 1)
             down, across = (p[depth, 0] for p in self._points(window, True))
-            part = bilinear(texture, (down + row).to(texture), (across + column).to(texture))
-            image[:, top : top + height + 1, left : left + width + 1] = part
+            places = [2.0 * (across + column) / (width - 1) - 1.0]
+            places.append(2.0 * (down + row) / (height - 1) - 1.0)
+            (part,) = functional.grid_sample(
+                texture[None],
+                torch.stack(places, -1)[None].to(texture),
+                mode="bicubic",
+                padding_mode="border",
+                align_corners=True,
+            )
+            image[:, top : top + rows + 1, left : left + columns + 1] = part.clamp(0.0, 1.0)
         return image
 
     @torch.no_grad()
@@ -274,17 +287,18 @@ class WholeField:
     def window(self) -> int:
         """Return how many pixels along each side a function of their middle serves."""
         rows, columns = spread_pixels(self.sensor, _COMPARED)
-        for side in _WINDOWS:
+        least = max(_WINDOWS[-1], self.renderer.size)
+        for side in (side for side in _WINDOWS if side > least):
             # Towards the axis, so as to stay on the sensor.
             shift = [
-                torch.where(p < 0.5 * length, _AWAY, -_AWAY) * side
+                torch.where(p < 0.5 * length, _AWAY, -_AWAY) * min(side, length)
                 for p, length in ((rows, self.sensor.height), (columns, self.sensor.width))
             ]
             both = torch.cat((rows, rows + shift[0])), torch.cat((columns, columns + shift[1]))
             own, other = self.functions(*both).split(_COMPARED)
             if float(grey_levels(own - other).square().mean().sqrt()) <= _OFF:
                 return side
-        return _NARROWEST
+        return least
 
     def _nodes(self, row: int, depth: int) -> FieldPointSpreadFunctions:
         """The functions of a row of nodes, in a plane: (nodes, 1, 3, K, K)."""

@@ -156,7 +156,8 @@ def written(
     if options.save_raw:
         files.append(folder / f"{name}_raw.npy")
         np.save(files[-1], signal.permute(1, 2, 0).squeeze(-1).float().cpu().numpy())
-    title = f"{name.removesuffix(f'_{label(depth)}')} at {depth / 1000.0:g} m"
+    where = f"{depth / 1000.0:g} m" if math.isfinite(depth) else "infinity"
+    title = f"{name.removesuffix(f'_{label(depth)}')} at {where}"
     numbers = {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]}
     files.append(folder / f"{name}_comparison.png")
     save_figure(applied_figure(images, numbers, title), files[-1])

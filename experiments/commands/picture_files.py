@@ -16,6 +16,7 @@ from dolens.sensor.pictures import read_pixels
 
 _TIFF = (".tif", ".tiff")
 _PNG_COLOURS = {1: 0, 3: 2}
+_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,11 @@ def write_picture(path: Path, encoded: Tensor, bits: int) -> None:
         bits: 8 or 16.
     """
     scale, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
-    values = (encoded.detach().cpu().clamp(0.0, 1.0) * scale).round().permute(1, 2, 0)
-    pixels = values.numpy().astype(kind)
+    pixels = np.empty((*encoded.shape[1:], len(encoded)), kind)
+    # Some rows at a time, for memory.
+    for first in range(0, len(pixels), _ROWS):
+        part = encoded[:, first : first + _ROWS].detach().cpu().clamp(0.0, 1.0) * scale
+        pixels[first : first + _ROWS] = part.round().permute(1, 2, 0).numpy()
     if path.suffix.lower() in _TIFF:
         tifffile.imwrite(path, pixels, photometric="rgb", compression="zlib")
     elif bits == 8:
