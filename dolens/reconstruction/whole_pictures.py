@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.restoration import Restoration
-from dolens.reconstruction.untrained import WienerTVRestoration
 from dolens.sensor.readout import Readout
 
 # Pixels along which windows fade into each other, and beyond them that a restorer sees besides half
@@ -33,7 +33,7 @@ Illumination = Callable[[Tensor, Tensor], Tensor]
 
 def general_restorer() -> Restoration:
     """Return what restores the images of any lens, told its point spread functions and noise."""
-    return WienerTVRestoration()
+    return GeneralRestoration(by_depth=True).eval()
 
 
 class Stretch(NamedTuple):
