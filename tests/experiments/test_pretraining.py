@@ -181,7 +181,7 @@ def test_a_resumed_training_is_the_same_to_the_bit(composed, tmp_path):
 @pytest.mark.parametrize(
     ("expected", "overrides"),
     [
-        ("network: UNetRestoration; allowed for pretraining: general", ["network=unet"]),
+        ("network: FeaturePyramidRestoration; allowed for", ["network=feature_pyramid"]),
         ("variables: allowed for pretraining: null", ["variables={sensor_distance: {scale: 0.2}}"]),
         ("data.lenses", ["data.lenses=0"]),
         ("network.weights", ["network.weights=nowhere.pt"]),
