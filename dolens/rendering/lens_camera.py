@@ -1,6 +1,7 @@
 """The camera that a lens file means: its colours, its image circle, pixels for a picture."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -9,11 +10,17 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Status
+from dolens.rendering.chief_ray_map import fit_chief_ray_map
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
+from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 
 # A plane so far away that its blur differs from that at infinity by this share of a pixel; and mm,
 # between which it is.
 _PIXEL_SHARE, _FAR, _FARTHEST = 0.01, 1e6, 1e9
+# Shares of a sensor that are tried.
+_SHARES = [1.0 - 0.05 * n for n in range(11)]
 
 
 def colours_of(lens: Lens) -> tuple[float, float, float]:
@@ -33,15 +40,17 @@ def colours_of(lens: Lens) -> tuple[float, float, float]:
 
 @torch.no_grad()
 def image_circle(lens: Lens) -> float:
-    """Return the diameter (mm) of the image: what the prescription says, else that of its fields.
+    """Return the diameter (mm) of the image that a prescription means: the smaller of its sensor's
+    and that of its fields.
 
     Raises:
         InputError: it names no sensor and no field off the axis, or no chief ray of one arrives.
     """
-    if lens.sensor_diameter:
-        return float(lens.sensor_diameter)
+    sensor = float(lens.sensor_diameter or math.inf)
     points = [p for p in (lens.fields.points if lens.fields else ()) if math.hypot(*p) > 0.0]
     if not points:
+        if math.isfinite(sensor):
+            return sensor
         raise InputError(
             f"lens '{lens.name}' names no sensor's diameter and no field off the axis: give the "
             "sensor's width and height"
@@ -52,25 +61,49 @@ def image_circle(lens: Lens) -> float:
     hit = lens.trace(rays)
     arrives = (hit.status == Status.OK) | (hit.status == Status.VIGNETTED)
     away = (hit.position - hit.position[0])[..., :2].norm(dim=-1)[arrives & rays.converged]
-    if not (len(away) and float(away.max()) > 0.0):
+    if len(away) and float(away.max()) > 0.0:
+        return min(sensor, 2.0 * float(away.max()))
+    if math.isinf(sensor):
         raise InputError(
             f"lens '{lens.name}': no chief ray of its fields reaches the sensor: give the "
             "sensor's width and height"
         )
-    return 2.0 * float(away.max())
+    return sensor
+
+
+def usable_share(lens: Lens, sensor: Sensor) -> float:
+    """Return the share of a sensor, along each side, whose chief rays pass the lens.
+
+    Renderers aim them at the centre of the paraxial exit pupil; where the pupil's aberrations are
+    large, as in the lenses of phones, those of a sensor's corners may not pass.
+
+    Returns:
+        1, or less in steps of 0.05; 0 where half of the sensor is too much.
+    """
+    scene = PlanarScene((_FAR,), colours_of(lens))
+    system = lens.system()
+    pupil = paraxial_exit_pupil(system, scene.wavelengths)
+    for share in _SHARES:
+        part = replace(sensor, pixel_pitch=share * sensor.pixel_pitch)
+        try:
+            fit_chief_ray_map(ImagingSystem(system, scene, part, pupil))
+        except InputError:
+            continue
+        return share
+    return 0.0
 
 
 def sensor_for(
-    picture: tuple[int, int],
     extent: float | tuple[float, float],
+    picture: tuple[int, int],
     scale: float = 1.0,
     pitch: float | None = None,
 ) -> Sensor:
     """Return the pixels of a picture that is as large as fits on a sensor.
 
     Args:
-        picture: its height and width, pixels.
         extent: of the sensor, mm: the diameter of a circle, or height and width.
+        picture: its height and width, pixels.
         scale: pixels of the picture to one of the sensor, along each side.
         pitch: of the pixels, mm; None: what the scale makes of it.
     """

@@ -58,9 +58,8 @@ _SAMPLES = 48
 # within one: by so much, restored pictures are off in bright light, and by less in noise.  Smaller
 # windows than the last are not worth their margins, nor are those that functions are wider than.
 _WINDOWS, _OFF = (512, 256, 128), 1.5
-# Points at which functions are compared, and their distance from a window's middle over its side,
-# down and across: that of its pixels, root mean square.
-_COMPARED, _AWAY = 16, 0.29
+# Points at which functions are compared with those of their windows' middles.
+_COMPARED = 24
 
 
 @dataclass(frozen=True)
@@ -286,16 +285,15 @@ class WholeField:
 
     def window(self) -> int:
         """Return how many pixels along each side a function of their middle serves."""
-        rows, columns = spread_pixels(self.sensor, _COMPARED)
+        pixels = spread_pixels(self.sensor, _COMPARED)
         least = max(_WINDOWS[-1], self.renderer.size)
         for side in (side for side in _WINDOWS if side > least):
-            # Towards the axis, so as to stay on the sensor.
-            shift = [
-                torch.where(p < 0.5 * length, _AWAY, -_AWAY) * min(side, length)
-                for p, length in ((rows, self.sensor.height), (columns, self.sensor.width))
+            middles = [
+                _middles(p, length, math.ceil(length / side))
+                for p, length in zip(pixels, (self.sensor.height, self.sensor.width), strict=True)
             ]
-            both = torch.cat((rows, rows + shift[0])), torch.cat((columns, columns + shift[1]))
-            own, other = self.functions(*both).split(_COMPARED)
+            rows, columns = (torch.cat(pair) for pair in zip(pixels, middles, strict=True))
+            own, other = self.functions(rows, columns).split(_COMPARED)
             if float(grey_levels(own - other).square().mean().sqrt()) <= _OFF:
                 return side
         return least
@@ -376,3 +374,9 @@ class WholeField:
 def _borders(length: int, count: int) -> tuple[int, ...]:
     """Whole pixels next to nodes evenly along a side, the ends included, each once."""
     return tuple(sorted({round(n * (length - 1) / (count - 1)) for n in range(count)}))
+
+
+def _middles(pixels: Tensor, length: int, count: int) -> Tensor:
+    """The middles of the parts that pixels lie in, of a side in `count` of one length."""
+    part = length / count
+    return ((pixels / part).floor().clamp(max=count - 1) + 0.5) * part - 0.5

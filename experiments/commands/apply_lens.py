@@ -23,7 +23,13 @@ from dolens.experiments.commands.picture_files import read_picture
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
 from dolens.reconstruction.whole_pictures import general_restorer, restore_whole_picture
-from dolens.rendering.lens_camera import colours_of, distance_of, image_circle, sensor_for
+from dolens.rendering.lens_camera import (
+    colours_of,
+    distance_of,
+    image_circle,
+    sensor_for,
+    usable_share,
+)
 from dolens.rendering.whole_field import WholeField
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.colour import linear_to_srgb
@@ -67,10 +73,21 @@ class LensCamera:
             InputError: they are too many or too few, or no image circle is known.
         """
         options = self.options
-        extent: float | tuple[float, float]
-        extent = image_circle(self.lens) if options.sensor is None else options.sensor[::-1]
         pitch = None if options.pitch is None else options.pitch / 1000.0
-        sensor = sensor_for((height, width), extent, options.scale or 1.0, pitch)
+        settings: Any = ((height, width), options.scale or 1.0, pitch)
+        if options.sensor is not None:
+            sensor = sensor_for(options.sensor[::-1], *settings)
+        else:
+            circle = image_circle(self.lens)
+            sensor = sensor_for(circle, *settings)
+            share = usable_share(self.lens, sensor)
+            if 0.0 < share < 1.0:
+                logger.warning(
+                    "Chief rays pass the lens to %.0f %% of its image circle alone: the sensor is "
+                    "smaller by so much",
+                    100.0 * share,
+                )
+                sensor = sensor_for(share * circle, *settings)
         pixels = 1e-6 * sensor.height * sensor.width
         if pixels > options.megapixels:
             raise InputError(

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.errors import InputError, one_line, readable
 from dolens.experiments.commands.apply import PictureCamera
+from dolens.experiments.commands.apply_lens import LensCamera
 from dolens.experiments.running.command_line import prepared
 from dolens.lens_page.page import Written
 
@@ -37,6 +38,10 @@ BESIDE = {
     ("show", "tolerances"): ["asphere", "--figures", "figures"],
     ("apply", "black_level"): ["run", "picture.png", "--raw"],
     ("apply", "white_level"): ["run", "picture.png", "--raw"],
+    **{
+        ("apply", name): ["asphere", "picture.png"]
+        for name in ("light", "read_noise", "sensor", "pitch")
+    },
     ("export", "checkpoint"): ["run", "--only", "torch"],
     ("export", "image_size"): ["run", "--only", "torch"],
     ("export", "multiple_of"): ["run", "--only", "torch"],
@@ -115,6 +120,7 @@ def at_work(work, monkeypatch):
     monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda _: nothing)
     for name in ("apply", "restore"):
         monkeypatch.setattr(PictureCamera, name, lambda *_: [])
+    monkeypatch.setattr(LensCamera, "apply", lambda *_: [])
 
 
 def said(given):

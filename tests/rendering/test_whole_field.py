@@ -8,7 +8,13 @@ import torch
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.lens_camera import colours_of, distance_of, image_circle, sensor_for
+from dolens.rendering.lens_camera import (
+    colours_of,
+    distance_of,
+    image_circle,
+    sensor_for,
+    usable_share,
+)
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.rendering.relative_illumination import relative_illumination
 from dolens.rendering.whole_field import WholeField
@@ -21,7 +27,7 @@ FAR = 1e6
 
 def field_of(name, height, width, depths=(FAR,), diffraction="none", circle=None):
     lens = load_lens(name)
-    sensor = sensor_for((height, width), circle or image_circle(lens))
+    sensor = sensor_for(circle or image_circle(lens), (height, width))
     return WholeField.of(lens, PlanarScene(depths, LINES), sensor, diffraction)
 
 
@@ -32,10 +38,16 @@ def gauss():
 
 
 @pytest.fixture(scope="module")
+def fine():
+    """The same lens before pixels of a third of the size."""
+    return field_of("double_gauss", 450, 600)
+
+
+@pytest.fixture(scope="module")
 def texture(gauss):
-    """Noise, smooth over some texels, that covers the sensor."""
+    """Noise, smooth over five texels, that covers the sensor."""
     shape = gauss.texture(torch.zeros(3, 150, 200)).shape
-    coarse = torch.rand(1, 3, *(-(-n // 3) for n in shape[1:]))
+    coarse = torch.rand(1, 3, *(-(-n // 5) for n in shape[1:]))
     return torch.nn.functional.interpolate(coarse, shape[1:], mode="bicubic")[0].clamp(0.0, 1.0)
 
 
@@ -67,9 +79,9 @@ def test_a_pixel_is_the_truth_weighted_by_the_function_of_its_place(gauss, textu
     assert torch.allclose(found, expected, atol=0.01)
 
 
-def test_the_image_of_a_point_is_the_function_of_its_place():
+def test_the_image_of_a_point_is_the_function_of_its_place(fine):
     """Off the axis, and far from symmetric: another colour's or a mirrored one is another."""
-    field = field_of("double_gauss", 450, 600)
+    field = fine
     texture = torch.zeros_like(field.texture(torch.zeros(3, 450, 600)))
     texture[:, 60, 80] = 1.0
     image, truth = field.image(texture), field.truth(texture)[1]
@@ -94,7 +106,7 @@ def test_the_image_of_a_point_is_the_function_of_its_place():
     assert (expected[0][:, 0] - expected[0][:, 2]).abs().min() > 0.06
     assert expected[0].abs().min() > 0.06 and expected[1][2].abs().min() > 0.06
     light = field.illumination(row[None], column[None])[:, 0, 0]
-    assert torch.allclose(image.sum((-2, -1)), light, rtol=0.03)
+    assert torch.allclose(image.sum((-2, -1)), light, rtol=0.04)
 
 
 def test_waves_make_the_same_functions_where_diffraction_hardly_shows(gauss):
@@ -147,8 +159,8 @@ def test_depths_have_functions_of_their_own():
     assert field.image(texture, 0).std() > 1.2 * field.image(texture, 1).std()
 
 
-def test_windows_are_small_where_blur_changes_fast(gauss):
-    assert gauss.window() < field_of("cooke_triplet", 60, 90).window() == 512
+def test_windows_are_small_where_blur_changes_fast(fine):
+    assert fine.window() < field_of("cooke_triplet", 100, 150).window() == 512
 
 
 def test_what_has_no_image_is_refused():
@@ -180,17 +192,32 @@ def test_the_image_circle_is_the_file_s_or_that_of_its_fields():
     lens.sensor_diameter = None
     paraxial = 2.0 * float(lens.first_order(587.5618).efl) * math.tan(math.radians(22.0))
     assert image_circle(lens) == pytest.approx(paraxial, rel=0.02)
-    lens.fields = None
+    lens.sensor_diameter, lens.fields = 60.0, None
+    assert image_circle(lens) == 60.0
+    lens.sensor_diameter = None
     with pytest.raises(InputError, match="no field off the axis: give the sensor's width"):
         image_circle(lens)
 
 
 def test_a_picture_is_as_large_as_fits_on_the_sensor():
-    assert sensor_for((300, 400), 50.0) == Sensor(300, 400, 0.1)
-    assert sensor_for((300, 400), 50.0, scale=2.0) == Sensor(150, 200, 0.2)
-    assert sensor_for((300, 400), 50.0, pitch=0.05) == Sensor(600, 800, 0.05)
-    assert sensor_for((300, 400), (24.0, 36.0)) == Sensor(300, 400, 0.08)
-    assert sensor_for((300, 400), (36.0, 24.0)) == Sensor(300, 400, 0.06)
+    assert sensor_for(50.0, (300, 400)) == Sensor(300, 400, 0.1)
+    assert sensor_for(50.0, (300, 400), scale=2.0) == Sensor(150, 200, 0.2)
+    assert sensor_for(50.0, (300, 400), pitch=0.05) == Sensor(600, 800, 0.05)
+    assert sensor_for((24.0, 36.0), (300, 400)) == Sensor(300, 400, 0.08)
+    assert sensor_for((36.0, 24.0), (300, 400)) == Sensor(300, 400, 0.06)
+
+
+def test_a_sensor_is_usable_as_far_as_chief_rays_pass():
+    """A phone's lens bends its exit pupil so much that rays from the corners miss it."""
+    assert usable_share(load_lens("double_gauss"), Sensor(150, 200, 0.3)) == 1.0
+    lens = load_lens("phone")
+    sensor = sensor_for(image_circle(lens), (150, 200))
+    share = usable_share(lens, sensor)
+    assert 0.5 < share < 1.0
+    with pytest.raises(InputError, match="do not pass"):
+        WholeField.of(lens, PlanarScene((FAR,), LINES), sensor)
+    smaller = sensor_for(share * image_circle(lens), (30, 40))
+    assert WholeField.of(lens, PlanarScene((FAR,), LINES), smaller, "none").cover() > 1.0
 
 
 def test_infinity_is_so_far_that_its_blur_is_less_than_a_pixel():

@@ -73,7 +73,7 @@ def choose_fields(
     if not candidates:
         raise InputError(
             f"renderer auto: point spread functions are wider than {_LARGEST} pixels; "
-            "use renderer=rays"
+            "give larger pixels, or renderer=rays"
         )
     nodes: dict[tuple[int, int], Survey] = {}
     best: tuple[float, PsfRenderer] | None = None
