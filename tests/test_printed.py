@@ -19,6 +19,7 @@ import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
+from PIL import Image
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -220,8 +221,13 @@ def test_a_command_about_a_lens_runs(words, in_it, here, monkeypatch):
 
 
 @those("apply", "evaluate", "compare", "report")
-def test_a_command_about_a_run_takes_the_arguments(words):
-    """It runs in tests/test_tutorials.py and tests/experiments."""
+def test_a_command_about_a_run_takes_the_arguments(words, in_it, here):
+    """It runs in tests/test_tutorials.py and tests/experiments; that of a lens runs here."""
+    if kind_of(words) == "apply" and "lens.zmx" in words:
+        Image.effect_noise((60, 40), 50).convert("RGB").save(here / "picture.jpg")
+        done = CliRunner().invoke(app, list(words[1:]))
+        assert done.exit_code == 0 and (here / "lens_applied/picture.json").is_file(), done.output
+        return
     command = get_command(app).commands[words[1]]
     command.make_context(words[1], list(words[2:]))
 
