@@ -38,10 +38,12 @@ class Experiment(lightning.LightningModule):
     Attributes:
         trains: whether there is anything to train; False makes `train=true` an error.
         metrics: names of the metrics that a run can have beside its costs; see `metric_names`.
+        precisions: of a trainer, that `check_trainer` lets pass.
     """
 
     trains: bool = True
     metrics: ClassVar[tuple[str, ...] | None] = None
+    precisions: ClassVar[tuple[str, ...]] = (EXACT,)
 
     def __init__(self, lens: Lens, experiment: str, folder: str | Path | None = None) -> None:
         super().__init__()
@@ -70,7 +72,7 @@ class Experiment(lightning.LightningModule):
         return {}
 
     def check_trainer(self, trainer: lightning.Trainer) -> None:
-        """Refuse a trainer that would do this work otherwise than one process in single precision.
+        """Refuse a trainer that would do this work otherwise than one process in `precisions`.
 
         An experiment that can share its batches among processes, accumulate gradients, or compute
         some of its work in half precision, overrides this.
@@ -86,8 +88,11 @@ class Experiment(lightning.LightningModule):
                 f"trainer.accumulate_grad_batches: {trainer.accumulate_grad_batches}; allowed for "
                 f"{kind}: 1"
             )
-        if trainer.precision != EXACT:
-            raise InputError(f"trainer.precision: {trainer.precision}; allowed for {kind}: {EXACT}")
+        if trainer.precision not in self.precisions:
+            allowed = ", ".join(self.precisions)
+            raise InputError(
+                f"trainer.precision: {trainer.precision}; allowed for {kind}: {allowed}"
+            )
 
     # ---------------------------------------------------------------- checkpoints
 

@@ -7,7 +7,6 @@ sensor with 3 electrons of read noise, and are restored.  Intervals are 95 %, ov
 """
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,18 +17,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dolens.diffraction.pupil_fit import RegularPupil, regular_pupil
 from dolens.errors import InputError
 from dolens.experiments.data.package_photographs import (
-    MANIFEST,
+    PackagePhotographsDataModule,
     data_folders,
-    find_files,
-    read_manifest,
-    shrunk,
 )
-from dolens.experiments.data.photographs import read_photograph
 from dolens.experiments.pretraining.examples import blurred
 from dolens.experiments.pretraining.pixel_functions import pixel_functions
 from dolens.experiments.pretraining.traced_pupils import fitted_pupils
@@ -42,7 +36,8 @@ from dolens.reconstruction import (
     psnr_db,
     structural_similarity,
 )
-from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
+from dolens.reconstruction.intervals import gain_interval
+from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 
 SIDE, MARGIN, SCALE = 128, 32, 1.5
@@ -68,7 +63,7 @@ JUDGES = {
     "telephoto": Judge("published/telephoto_smith_p175_sigler", (0.0, 0.7), 4.0),
     "doublet of a large field": Judge("large_fov_doublet_designed", (0.0, 15.0), 20.0),
     "triplet, corner of the field": Judge("cooke_triplet", (0.0, 20.0), 8.0),
-    "Tessar from Zemax": Judge("published/tessar_us2573511_ex1", (0.0, 15.0), 10.0),
+    "Tessar": Judge("published/tessar_us2573511_ex1", (0.0, 15.0), 10.0),
     "singlet": Judge("la1131", (0.0, 0.0), 60.0),
     "double Gauss, out of focus": Judge("double_gauss", (0.0, 0.0), 15.0, 0.15),
     "free of blur": Judge("cooke_triplet", (0.0, 0.0), 40.0),
@@ -104,16 +99,14 @@ def functions_of(judge: Judge) -> Tensor:
 
 def scenes_of(folders: Sequence[Path]) -> Tensor:
     """Return the middles of the 42 test photographs with margins, linear light, (42, 3, S, S)."""
-    entries = [entry for entry in read_manifest(MANIFEST) if entry.split == "test"]
-    size = SIDE + 2 * MARGIN
-    cut = int(SCALE * size)
-    found = []
-    for entry, file in zip(entries, find_files(entries, folders), strict=True):
-        encoded = shrunk(read_photograph(file, entry.path), 1280).encoded
-        top, left = ((length - cut) // 2 for length in encoded.shape[-2:])
-        crop = srgb_to_linear(encoded[:, top : top + cut, left : left + cut] / 255.0)
-        found.append(interpolate(crop[None], (size, size), mode="area")[0])
-    return torch.stack(found)
+    data = PackagePhotographsDataModule(
+        folders=[str(folder) for folder in folders],
+        crop_size=SIDE,
+        margin=MARGIN,
+        evaluation_crops_per_photograph=1,
+        evaluation_scale=SCALE,
+    )
+    return torch.cat(list(data.test_dataloader()))
 
 
 def scores(
@@ -167,11 +160,13 @@ def rows(
     for label, network in restorers.items():
         psnr, ssim, seconds = scores(network, raw, functions, noise, truth)
         first = psnr if first is None else first
-        gain = psnr - first
-        half = 1.96 * float(gain.std()) / math.sqrt(len(gain))
+        own, other = psnr[None, :, None], first[None, :, None]
+        generator = torch.Generator().manual_seed(0)
+        gain = gain_interval(own, other, lambda means: means.squeeze(-1), generator)
         yield (
             f"| {name} | {label} | {float(psnr.mean()):.2f} | {float(ssim.mean()):.3f} "
-            f"| {float(gain.mean()):+.2f} ± {half:.2f} | {int((gain > 0).sum())} | {seconds:.2f} |"
+            f"| {gain.estimate:+.2f} [{gain.low:+.2f}, {gain.high:+.2f}] "
+            f"| {int((psnr > first).sum())} | {seconds:.2f} |"
         )
 
 

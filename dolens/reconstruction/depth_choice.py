@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+from dolens.reconstruction.untrained import REFERENCE_VARIANCE
 from dolens.reconstruction.wiener import (
     close_periodically,
     padded_lengths,
@@ -26,8 +27,6 @@ from dolens.reconstruction.wiener import (
 # photographs; here are its factors, and what is added to the exponent 2 of 1/f².
 _CONTRASTS = (0.06, 0.25, 1.0, 4.0, 16.0)
 _SLOPES = (-0.6, 0.0, 0.6, 1.2)
-# The signal's power for them; see `REFERENCE_VARIANCE` of the untrained restorers.
-_POWER = 0.0034
 # Deviation of the Gaussian neighbourhood, pixels.
 _REACH = 8.0
 # Share of its values that count as independent: a photograph is no Gaussian field.
@@ -68,7 +67,7 @@ def depth_probabilities(raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor
     def likelihood(depth: int) -> Tensor:
         found = []
         for contrast, slope in product(_CONTRASTS, _SLOPES):
-            signal = contrast * _POWER / 3.0 * square ** (-1.0 - slope / 2.0)
+            signal = contrast * REFERENCE_VARIANCE / 3.0 * square ** (-1.0 - slope / 2.0)
             density = signal * power[depth] + variance
             filtered = spectrum * density.rsqrt()
             filtered[..., 0, 0] = 0.0  # the mean tells nothing of the blur

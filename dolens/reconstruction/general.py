@@ -23,10 +23,11 @@ from dolens.reconstruction.opponent_wiener import (
     check_functions,
     colour_filters,
     correlations,
+    over_depths,
     solve_in_opponent_colours,
 )
 from dolens.reconstruction.restoration import COLORS, Restoration
-from dolens.reconstruction.untrained import REFERENCE_VARIANCE
+from dolens.reconstruction.untrained import LEAST_SHOT, REFERENCE_VARIANCE
 from dolens.reconstruction.wiener import (
     close_periodically,
     padded_lengths,
@@ -46,8 +47,6 @@ _BANDS = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 _GRID = 128
 IMAGES = COLORS * (1 + len(_RATIOS))
 KNOWN = 3 + (len(_BANDS) - 1) * (2 * len(_RATIOS) + 1)
-# Noise of less than a thousandth of the reference's is invisible.
-_LEAST_SHOT = 1e-5
 # The trained weights of the default widths, in half precision; docs/general_restorer.md tells how
 # they were made.
 WEIGHTS = Path(__file__).with_suffix(".pt")
@@ -118,9 +117,10 @@ def prepared(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     check_functions(functions)
     functions = functions.to(raw)
     shot, read = noise.to(raw).unbind()
-    shot = shot.clamp(min=_LEAST_SHOT)
+    shot = shot.clamp(min=LEAST_SHOT)
     ratios = raw.new_tensor(_RATIOS) * (_MEAN_LIGHT * shot + read) / REFERENCE_VARIANCE
-    stabiliser = Stabiliser((read / shot + 0.375 * shot).expand(len(raw)))
+    pedestal = read / shot + 0.375 * shot
+    stabiliser = Stabiliser(pedestal.expand(len(raw)))
 
     height, width = raw.shape[-2:]
     rows, columns = padded_lengths(height, width, functions.shape[-1] // 2, functions.shape[-1])
@@ -136,21 +136,10 @@ def prepared(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     images = stabiliser.forward(torch.cat([raw[:, None], light], dim=1)).flatten(1, 2)
 
     # Of one unit of light y's noise has this deviation where shot noise rules.
-    deviation = (
-        0.5 * shot.sqrt() * ((1.0 + stabiliser.pedestal[0]).sqrt() + stabiliser.pedestal[0].sqrt())
-    )
-    known = torch.cat(
-        [
-            torch.stack(
-                [
-                    deviation.log10(),
-                    stabiliser.pedestal[0].log10(),
-                    raw.new_tensor(float(len(functions) > 1)),
-                ]
-            ),
-            _known_in_bands(functions, ratios, deviation),
-        ]
-    )
+    deviation = 0.5 * shot.sqrt() * ((1.0 + pedestal).sqrt() + pedestal.sqrt())
+    several = raw.new_tensor(float(len(functions) > 1))
+    known = torch.stack([deviation.log10(), pedestal.log10(), several])
+    known = torch.cat([known, _known_in_bands(functions, ratios, deviation)])
     return Prepared(images, known.expand(len(raw), -1), stabiliser.pedestal)
 
 
@@ -160,7 +149,7 @@ def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Ten
     """
     side = max(_GRID, functions.shape[-1] + functions.shape[-1] % 2)
     transfer = transfer_function(functions, side, side)
-    matched, power = transfer.mean(dim=0).conj(), transfer.abs().square().mean(dim=0)
+    matched, power = over_depths(transfer)
     count = len(ratios)
     filters = colour_filters(
         power.expand(count, *power.shape), matched.expand(count, *matched.shape), ratios, side
@@ -277,17 +266,13 @@ class GeneralRestoration(Restoration):
         Raises:
             InputError: `point_spread_functions` or `noise` is None, or of another shape.
         """
-        if point_spread_functions is None or noise is None:
-            raise InputError(
-                "GeneralRestoration needs the lens's point spread functions and the sensor's "
-                "noise: use a renderer that gives them"
-            )
+        functions, noise = self.functions_and_noise(point_spread_functions, noise)
         raw = raw.to(self.dtype)
-        common = self.restored(prepared(raw, point_spread_functions, noise))
-        if not self.by_depth or len(point_spread_functions) == 1:
+        common = self.restored(prepared(raw, functions, noise))
+        if not self.by_depth or len(functions) == 1:
             return common
-        own = [self.restored(prepared(raw, f[None], noise)) for f in point_spread_functions]
-        shares = picture_weights(depth_probabilities(raw, point_spread_functions, noise))
+        own = [self.restored(prepared(raw, f[None], noise)) for f in functions]
+        shares = picture_weights(depth_probabilities(raw, functions, noise))
         return (shares[:, :, None] * torch.stack([*own, common], dim=1)).sum(dim=1)
 
     def restored(self, given: Prepared) -> Tensor:

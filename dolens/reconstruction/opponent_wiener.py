@@ -196,7 +196,11 @@ def correlations(functions: Tensor, rows: int, columns: int) -> tuple[Tensor, Te
         rows: of the padded image.
         columns: of the padded image.
     """
-    transfer = transfer_function(functions, rows, columns)
+    return over_depths(transfer_function(functions, rows, columns))
+
+
+def over_depths(transfer: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean H* and mean |H|² of transfer functions (D, ...), each (...)."""
     power = (transfer.real**2 + transfer.imag**2).mean(dim=0)
     return transfer.mean(dim=0).conj(), power
 

@@ -65,6 +65,21 @@ class Restoration(nn.Module):
         """Return what `forward` takes after the field: the noise (2,) where it is asked for."""
         return [torch.tensor(noise)] if self.needs_noise else []
 
+    def functions_and_noise(
+        self, functions: Tensor | None, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return point spread functions and noise, of a network that needs both.
+
+        Raises:
+            InputError: one of them is None.
+        """
+        if functions is None or noise is None:
+            raise InputError(
+                f"{type(self).__name__} needs the lens's point spread functions and the sensor's "
+                "noise: use a renderer that gives them"
+            )
+        return functions, noise
+
     @property
     def dtype(self) -> torch.dtype:
         """Return the floating-point type of the parameters, or of the buffers if there are none."""

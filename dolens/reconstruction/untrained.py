@@ -34,6 +34,10 @@ Array = NDArray[np.float64]
 # a quarter of white, near the mean of photographs.
 REFERENCE_VARIANCE = 0.25 / 100.0 + (3.0 / 100.0) ** 2
 
+# Of the noise's variance for each unit of light: without noise there is nothing to even out, and a
+# thousandth of the reference's is invisible.
+LEAST_SHOT = 1e-5
+
 
 class UntrainedRestoration(Restoration):
     """Restore by a Wiener filter in opponent colours and a denoiser behind it.
@@ -82,19 +86,14 @@ class UntrainedRestoration(Restoration):
         Raises:
             InputError: `point_spread_functions` or `noise` is None, or of another shape.
         """
-        if point_spread_functions is None or noise is None:
-            raise InputError(
-                f"{type(self).__name__} needs the lens's point spread functions and the sensor's "
-                "noise: use a renderer that gives them"
-            )
-        check_functions(point_spread_functions)
-        functions = point_spread_functions.to(raw.device, self.dtype)
+        functions, noise = self.functions_and_noise(point_spread_functions, noise)
+        check_functions(functions)
+        functions = functions.to(raw.device, self.dtype)
         return torch.stack([self._restored(one, functions, noise) for one in raw.to(self.dtype)])
 
     def _restored(self, raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor:
         shot, read = (float(value) for value in noise)
-        # Without noise there is nothing to even out; a thousandth of the reference's is invisible.
-        shot = max(shot, 1e-5)
+        shot = max(shot, LEAST_SHOT)
         height, width = raw.shape[-2:]
         ratio = (shot * float(raw.mean().clamp(min=0.0)) + read) / REFERENCE_VARIANCE
         size = functions.shape[-1]

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.restoration import Restoration
 from dolens.sensor.readout import Readout
 
@@ -29,11 +28,6 @@ _DARKEST = 0.05
 Functions = Callable[[Tensor, Tensor], Tensor]
 # Rows (H,) and columns (W,), pixels, to relative illumination (3, H, W).
 Illumination = Callable[[Tensor, Tensor], Tensor]
-
-
-def general_restorer() -> Restoration:
-    """Return what restores the images of any lens, told its point spread functions and noise."""
-    return GeneralRestoration(by_depth=True).eval()
 
 
 class Stretch(NamedTuple):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.commands.apply_options import PictureOptions
-from dolens.experiments.commands.picture_files import write_picture
+from dolens.experiments.commands.picture_files import Picture, read_picture, write_picture
 from dolens.experiments.running.run_files import write_json
 from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
@@ -97,6 +97,18 @@ def check_files(files: Sequence[str | Path]) -> None:
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"{twice}: two pictures of this name would write the same files")
+
+
+def picture_of(file: Path, options: PictureOptions) -> Picture:
+    """Read a picture, and log what of its file is not taken as it stands.
+
+    Raises:
+        InputError: the file cannot be read, or is too large.
+    """
+    picture = read_picture(file, options.megapixels)
+    for note in picture.notes:
+        logger.warning("%s: %s", file, note)
+    return picture
 
 
 def check_size(file: Path, size: Sequence[int]) -> None:

@@ -22,14 +22,11 @@ from dolens.experiments.commands.applied import (
     check_files,
     check_size,
     names_at_depths,
+    picture_of,
     written,
 )
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.picture_files import (
-    read_array,
-    read_picture,
-    write_picture,
-)
+from dolens.experiments.commands.picture_files import read_array, write_picture
 from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
@@ -88,9 +85,7 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or is too small; or the depth lies in the lens.
         """
-        picture = read_picture(file, self.options.megapixels)
-        for note in picture.notes:
-            logger.warning("%s: %s", file, note)
+        picture = picture_of(file, self.options)
         check_size(file, picture.linear.shape[-2:])
         names = names_at_depths(picture.name, self.depths())
         return [

@@ -16,13 +16,14 @@ from dolens.experiments.commands.applied import (
     check_files,
     check_size,
     names_at_depths,
+    picture_of,
     written,
 )
 from dolens.experiments.commands.apply_options import LensOptions
-from dolens.experiments.commands.picture_files import read_picture
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
-from dolens.reconstruction.whole_pictures import general_restorer, restore_whole_picture
+from dolens.reconstruction import GeneralRestoration
+from dolens.reconstruction.whole_pictures import restore_whole_picture
 from dolens.rendering.lens_camera import (
     colours_of,
     distance_of,
@@ -53,7 +54,7 @@ class LensCamera:
 
     def __init__(self, lens: Lens, options: LensOptions) -> None:
         self.lens, self.options = lens.requires_grad_(False), options
-        self.restorer = general_restorer()
+        self.restorer = GeneralRestoration(by_depth=True).eval()
         self.readout = Readout(
             full_well=options.light,
             read_noise=options.read_noise / options.light,
@@ -102,9 +103,7 @@ class LensCamera:
         Raises:
             InputError: the file cannot be read, or is too small; or the lens cannot image it.
         """
-        picture = read_picture(file, self.options.megapixels)
-        for note in picture.notes:
-            logger.warning("%s: %s", file, note)
+        picture = picture_of(file, self.options)
         sensor = self.sensor(*picture.linear.shape[-2:])
         check_size(file, (sensor.height, sensor.width))
         field = self._field

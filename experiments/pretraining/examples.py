@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 from torch.utils.data import Dataset
 
+from dolens.experiments.pretraining.random_pupils import Draw
 from dolens.reconstruction.general import Prepared, prepared
 from dolens.reconstruction.wiener import transfer_function
 from dolens.sensor.bayer import PATTERNS
@@ -97,36 +98,30 @@ class Examples(Dataset[Example]):
 
     def _camera(self, generator: torch.Generator) -> Example:
         """Return the crops of one camera."""
-
-        def uniform(low: float = 0.0, high: float = 1.0) -> float:
-            return low + (high - low) * float(torch.rand((), generator=generator))
-
-        draws = self.draws
+        draw, draws = Draw(generator), self.draws
         chosen = int(torch.randint(len(self.functions), (), generator=generator))
         functions = self.functions[chosen].float()
         functions = functions / functions.sum(dim=(-2, -1), keepdim=True)  # of half precision
         turns = int(torch.randint(4, (), generator=generator))
         functions = functions.rot90(turns, (-2, -1))
-        if uniform() < 0.5:
+        if draw.chance(0.5):
             functions = functions.flip(-1)
         functions = functions[:, torch.randperm(3, generator=generator)]
         depth = int(torch.randint(len(functions), (), generator=generator))
         told = functions
-        if uniform() < draws.own_depth:
+        if draw.chance(draws.own_depth):
             told = functions[depth : depth + 1]
-        elif uniform() < draws.wrong:
+        elif draw.chance(draws.wrong):
             told = torch.cat([functions[:depth], functions[depth + 1 :]])
 
-        light = math.exp(uniform(*(math.log(value) for value in draws.light)))
+        light = draw.log_uniform(*draws.light)
         # Half of the cameras read quietly, as sensors of today do.
-        read = draws.read_noise * uniform() ** 2
+        read = draws.read_noise * draw.uniform() ** 2
         scenes = torch.stack([self._scene(generator) for _ in range(draws.crops)])
         image = blurred(scenes, functions[depth])
         side, margin = draws.side, self.margin
         inner = slice(margin, margin + side)
-        pattern = None
-        if uniform() < draws.bayer:
-            pattern = list(PATTERNS)[int(torch.randint(4, (), generator=generator))]
+        pattern = draw.one_of(list(PATTERNS)) if draw.chance(draws.bayer) else None
         well = max(light, 1000.0)
         readout = Readout.at_light(light, well, read_noise=read / well, pattern=pattern)
         raw = readout.develop(readout(image[..., inner, inner].clamp(min=0.0), generator))
@@ -135,11 +130,12 @@ class Examples(Dataset[Example]):
 
     def _scene(self, generator: torch.Generator) -> Tensor:
         """Return linear light of a crop with its margins, (3, S, S)."""
+        draw = Draw(generator)
         number = int(torch.multinomial(self.weights, 1, generator=generator))
         photograph = self.photographs[number]
         size = self.draws.side + 2 * self.margin
         most = min(self.draws.scale, min(photograph.shape[-2:]) / size)
-        cut = int(size * most ** float(torch.rand((), generator=generator)))
+        cut = int(size * draw.log_uniform(1.0, most))
 
         def place(length: int) -> int:
             return int(torch.randint(length - cut + 1, (), generator=generator))
@@ -149,13 +145,12 @@ class Examples(Dataset[Example]):
         if cut > size:
             crop = interpolate(crop[None], (size, size), mode="bilinear", antialias=True)[0]
         crop = crop.rot90(int(torch.randint(4, (), generator=generator)), (-2, -1))
-        if torch.rand((), generator=generator) < 0.5:
+        if draw.chance(0.5):
             crop = crop.flip(-1)
-        if torch.rand((), generator=generator) < 0.3:
+        if draw.chance(0.3):
             crop = crop[torch.randperm(3, generator=generator)]
         least = self.draws.dimming
-        gain = least + (1.0 - least) * torch.rand((), generator=generator).sqrt()
-        return gain * crop
+        return (least + (1.0 - least) * math.sqrt(draw.uniform())) * crop
 
 
 def blurred(scenes: Tensor, functions: Tensor) -> Tensor:

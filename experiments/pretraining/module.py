@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.camera import CameraModule
+from dolens.experiments.experiment import EXACT, MIXED, Experiment
 from dolens.experiments.pretraining.examples import Example
 from dolens.reconstruction.general import GeneralRestoration, Prepared
 
@@ -28,6 +29,8 @@ class PretrainingModule(CameraModule):
         InputError: the network is none for any lens, or the camera has variables.
     """
 
+    precisions = (EXACT, MIXED)
+
     def __init__(self, **camera: Any) -> None:
         super().__init__(**camera)
         if not isinstance(self.network, GeneralRestoration):
@@ -38,11 +41,8 @@ class PretrainingModule(CameraModule):
             raise InputError("variables: allowed for pretraining: null, the camera only judges")
 
     def check_trainer(self, trainer: lightning.Trainer) -> None:
-        """Refuse several processes and accumulated batches; see `Experiment.check_trainer`."""
-        if trainer.world_size > 1 or trainer.accumulate_grad_batches > 1:
-            raise InputError(
-                "trainer.devices, trainer.accumulate_grad_batches: allowed for pretraining: 1"
-            )
+        """Refuse what a camera could share: batches are made whole; see `Experiment`."""
+        Experiment.check_trainer(self, trainer)
 
     def training_step(self, batch: Example, batch_idx: int) -> Tensor:
         """Restore pictures of random lenses and sensors, and compare them with the truth."""

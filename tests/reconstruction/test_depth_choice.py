@@ -6,7 +6,7 @@ import torch
 from dolens.reconstruction import GeneralRestoration, psnr_db
 from dolens.reconstruction.depth_choice import depth_probabilities, picture_weights
 from dolens.sensor.colour import linear_to_srgb
-from tests.reconstruction.test_untrained import disc
+from tests.reconstruction.test_untrained import blurred, disc
 
 NEAR, FAR = disc(13, 1.0), disc(13, 4.5)
 DEPTHS = torch.cat([NEAR, FAR])
@@ -21,14 +21,6 @@ def natural(size=160, seed=0):
     values = torch.randn(size, size, generator=generator)
     field = torch.fft.irfft2(torch.fft.rfft2(values) / radius, s=(size, size))
     return (0.4 + 0.12 * field / field.std()).clamp(min=0.0).expand(3, size, size)
-
-
-def blurred(truth, functions):
-    size, height = functions.shape[-1], truth.shape[-1]
-    padded = torch.zeros_like(truth)
-    padded[:, :size, :size] = functions[0]
-    padded = padded.roll((-(size // 2), -(size // 2)), (-2, -1))
-    return torch.fft.irfft2(torch.fft.rfft2(truth) * torch.fft.rfft2(padded), s=(height, height))
 
 
 def two_depths(truth, light, seed=1):

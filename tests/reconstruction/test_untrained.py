@@ -26,16 +26,21 @@ def disc(size=9, radius=2.5):
     return (inside / inside.sum()).expand(1, 3, size, size).clone()
 
 
-def sensed(truth, functions, seed=0):
-    """What a sensor gives of linear light (3, H, W): blurred around the edges, with noise."""
+def blurred(truth, functions):
+    """Linear light (3, H, W) behind the first of some functions, around the edges."""
     size = functions.shape[-1]
     padded = torch.zeros_like(truth)
     padded[:, :size, :size] = functions[0]
     padded = padded.roll((-(size // 2), -(size // 2)), (-2, -1))
-    blurred = torch.fft.irfft2(torch.fft.rfft2(truth) * torch.fft.rfft2(padded), s=truth.shape[-2:])
+    return torch.fft.irfft2(torch.fft.rfft2(truth) * torch.fft.rfft2(padded), s=truth.shape[-2:])
+
+
+def sensed(truth, functions, seed=0):
+    """What a sensor gives of linear light (3, H, W): blurred around the edges, with noise."""
+    image = blurred(truth, functions)
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(truth.shape, generator=generator)
-    return blurred + (NOISE[0] * blurred + NOISE[1]).sqrt() * noise
+    return image + (NOISE[0] * image + NOISE[1]).sqrt() * noise
 
 
 def of_light(draws):

@@ -4,9 +4,13 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.reconstruction import Restoration, WienerTVRestoration, wiener_deconvolve
+from dolens.reconstruction import (
+    GeneralRestoration,
+    Restoration,
+    WienerTVRestoration,
+    wiener_deconvolve,
+)
 from dolens.reconstruction.whole_pictures import (
-    general_restorer,
     mirrored,
     restore_whole_picture,
     stretches,
@@ -162,9 +166,11 @@ def test_what_is_seen_at_once_does_not_grow_with_the_picture():
 
 def test_a_window_that_is_too_small_is_refused():
     with pytest.raises(InputError, match="window: 16; allowed: 32 or more"):
-        restore_whole_picture(general_restorer(), blocks(), BRIGHT, gaussians, even, 16)
+        restore_whole_picture(
+            GeneralRestoration(by_depth=True).eval(), blocks(), BRIGHT, gaussians, even, 16
+        )
 
 
 def test_the_general_restorer_takes_what_windows_tell():
-    restorer = general_restorer()
+    restorer = GeneralRestoration(by_depth=True).eval()
     assert restorer.needs_noise and restorer.needs_point_spread_function
