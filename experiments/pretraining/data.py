@@ -23,7 +23,7 @@ from dolens.experiments.pretraining.textures import dead_leaves, text
 logger = logging.getLogger(__name__)
 
 # Drawn pictures: of each kind, how often one is taken to one photograph, and their sides in pixels.
-_DRAWN = ((dead_leaves, 24), (text, 16))
+_DRAWN = ((dead_leaves, 36), (text, 20))
 _DRAWN_WEIGHT, _DRAWN_SIDE = 0.6, 512
 
 
