@@ -51,6 +51,7 @@ TRAINING = (
     "renderer.sensor.width=64",
     "views.psf_size=33",
     "data.margin=16",
+    "network=feature_wiener",
     "network.width=8",
     "loss.perceptual=none",
     "data.steps_per_epoch=1000000",

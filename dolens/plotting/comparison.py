@@ -28,6 +28,7 @@ def comparison_figure(
     labels: Sequence[str],
     psnr: Mapping[str, Sequence[float]] | None = None,
     title: str | None = None,
+    further: Mapping[str, Tensor] | None = None,
 ) -> Figure:
     """Show raw images above restored ones, one column a view. The truth stands at the left where it
     is the same for all views, else above them.  Labels stand above the columns.
@@ -39,6 +40,7 @@ def comparison_figure(
         labels: one a view.
         psnr: {"raw": dB per view, "restored": dB per view} for the titles, or None for none.
         title: above all.
+        further: name → pictures (views, 3, H, W), shown below.
 
     Returns:
         A figure whose pictures are not interpolated; values are clipped to [0, 1].
@@ -57,7 +59,7 @@ def comparison_figure(
         raise InputError(f"{views} views need as many labels, not {len(labels)}")
     if truth.ndim == 4 and torch.equal(truth, truth[:1].expand_as(truth)):
         truth = truth[0]
-    images = {"raw": raw, "restored": restored}
+    images = {"raw": raw, "restored": restored, **(further or {})}
     if truth.ndim == 4:
         images = {"truth": truth, **images}
     beside = int(truth.ndim == 3)

@@ -9,6 +9,7 @@ best of several.
 """
 
 import math
+from collections.abc import Sequence
 from itertools import product
 
 import torch
@@ -98,6 +99,19 @@ def picture_weights(probabilities: Tensor) -> Tensor:
         return torch.cat([probabilities, torch.zeros_like(probabilities)], dim=1)
     ahead = (depths * probabilities.amax(dim=1, keepdim=True) - 1.0) / (depths - 1.0)
     return torch.cat([ahead * probabilities, 1.0 - ahead], dim=1)
+
+
+def depth_picture(probabilities: Tensor, depths: Sequence[float]) -> Tensor:
+    """Return the mean vergence 1/z as a grey picture (B, 3, H, W): black the farthest depth, white
+    the nearest.
+
+    Args:
+        probabilities: (B, D, H, W); see `depth_probabilities`.
+        depths: z, D of them, not all alike.
+    """
+    vergence = torch.tensor([1.0 / depth for depth in depths]).to(probabilities)
+    grey = (vergence - vergence.min()) / (vergence.max() - vergence.min())
+    return torch.einsum("bdhw,d->bhw", probabilities, grey)[:, None].expand(-1, 3, -1, -1)
 
 
 def _near(values: Tensor) -> Tensor:

@@ -116,16 +116,11 @@ def prepared(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     """
     check_functions(functions)
     functions = functions.to(raw)
-    shot, read = noise.to(raw).unbind()
-    shot = shot.clamp(min=LEAST_SHOT)
-    ratios = raw.new_tensor(_RATIOS) * (_MEAN_LIGHT * shot + read) / REFERENCE_VARIANCE
-    pedestal = read / shot + 0.375 * shot
-    stabiliser = Stabiliser(pedestal.expand(len(raw)))
-
     height, width = raw.shape[-2:]
     rows, columns = padded_lengths(height, width, functions.shape[-1] // 2, functions.shape[-1])
     matched, power = correlations(functions, rows, columns)
     spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
+    ratios = noise_to_signal(noise.to(raw))
     solved = solve_in_opponent_colours(
         power,
         squared_frequency(rows, columns, raw),
@@ -133,14 +128,34 @@ def prepared(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
         (matched * spectrum)[:, None],
     )
     light = torch.fft.irfft2(solved, s=(rows, columns))[..., :height, :width]
-    images = stabiliser.forward(torch.cat([raw[:, None], light], dim=1)).flatten(1, 2)
+    return given_to_the_network(raw, light, functions, noise)
 
+
+def noise_to_signal(noise: Tensor) -> Tensor:
+    """Return the ratios of the three filters in opponent colours, (3, 3), at a noise (2,)."""
+    shot, read = noise.unbind()
+    variance = _MEAN_LIGHT * shot.clamp(min=LEAST_SHOT) + read
+    return noise.new_tensor(_RATIOS) * variance / REFERENCE_VARIANCE
+
+
+def given_to_the_network(raw: Tensor, light: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
+    """Return what the network is given where the filters' images (B, 3, 3, H, W) are known.
+
+    The other arguments are those of `prepared`.
+    """
+    ratios = noise_to_signal(noise.to(raw))
+    shot, read = noise.to(raw).unbind()
+    shot = shot.clamp(min=LEAST_SHOT)
+    pedestal = read / shot + 0.375 * shot
+    # Not len(raw), by which torch.export would fix the number of images.
+    stabiliser = Stabiliser(pedestal.expand(raw.shape[0]))
+    images = stabiliser.forward(torch.cat([raw[:, None], light], dim=1)).flatten(1, 2)
     # Of one unit of light y's noise has this deviation where shot noise rules.
     deviation = 0.5 * shot.sqrt() * ((1.0 + pedestal).sqrt() + pedestal.sqrt())
     several = raw.new_tensor(float(len(functions) > 1))
     known = torch.stack([deviation.log10(), pedestal.log10(), several])
-    known = torch.cat([known, _known_in_bands(functions, ratios, deviation)])
-    return Prepared(images, known.expand(len(raw), -1), stabiliser.pedestal)
+    known = torch.cat([known, _known_in_bands(functions.to(raw), ratios, deviation)])
+    return Prepared(images, known.expand(raw.shape[0], -1), stabiliser.pedestal)
 
 
 def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Tensor:
@@ -228,7 +243,7 @@ class GeneralRestoration(Restoration):
         )
         self.knowledge = nn.Sequential(nn.Linear(KNOWN, 64), nn.GELU(), nn.Linear(64, width))
         self.by_depth = by_depth
-        self.pretrained = weights != "none"
+        self.pretrained = self.restores_already = weights != "none"
         if self.pretrained:
             self.load_weights(WEIGHTS if weights == "package" else Path(weights))
         self.requires_grad_(not held)

@@ -29,13 +29,14 @@ class Restoration(nn.Module):
     spread functions and the field coordinates at all; where one is False they are ignored and
     may be None.  Where `needs_noise` is True, `forward` takes the sensor's noise besides, (2,): its
     variance at light x is noise[0]·x + noise[1].  `pretrained` tells whether any of the network
-    began with trained weights.
+    began with trained weights, `restores_already` whether all of it did, for restoring pictures.
     """
 
     needs_point_spread_function: ClassVar[bool] = False
     needs_field: bool = False
     needs_noise: ClassVar[bool] = False
     pretrained: bool = False
+    restores_already: bool = False
 
     def forward(
         self,

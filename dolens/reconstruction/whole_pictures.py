@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.reconstruction.restoration import Restoration
 from dolens.sensor.readout import Readout
 
 # Pixels along which windows fade into each other, and beyond them that a restorer sees besides half
@@ -26,6 +25,9 @@ _DARKEST = 0.05
 
 # Rows (N,) and columns (N,), pixels, to point spread functions (N, D, 3, K, K).
 Functions = Callable[[Tensor, Tensor], Tensor]
+# Of a window (1, 3, H, W), linear light, functions (D, 3, K, K), no field, and noise (2,): the
+# picture (1, 3, H, W).  A `Restoration` is one.
+Restorer = Callable[[Tensor, Tensor, None, Tensor], Tensor]
 # Rows (H,) and columns (W,), pixels, to relative illumination (3, H, W).
 Illumination = Callable[[Tensor, Tensor], Tensor]
 
@@ -85,7 +87,7 @@ def mirrored(first: int, end: int, length: int, device: torch.device | None = No
 
 @torch.no_grad()
 def restore_whole_picture(
-    restorer: Restoration,
+    restorer: Restorer,
     signal: Tensor,
     readout: Readout,
     functions: Functions,

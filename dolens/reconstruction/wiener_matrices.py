@@ -15,6 +15,14 @@ import torch
 from torch import Tensor, nn
 
 from dolens.reconstruction.feature_wiener import DeconvolvedRestoration
+from dolens.reconstruction.general import (
+    GeneralRestoration,
+    Prepared,
+    Stabiliser,
+    given_to_the_network,
+    noise_to_signal,
+)
+from dolens.reconstruction.opponent_wiener import colour_filters, correlations
 from dolens.reconstruction.restoration import COLORS, WienerUNetRestoration
 from dolens.reconstruction.wiener import close_periodically, padded_lengths, wiener_filter
 from dolens.sensor.colour import linear_to_srgb
@@ -228,6 +236,51 @@ class FixedWienerUNet(nn.Module):
         """Restore (B, 3, height, width) linear light to sRGB."""
         encoded = linear_to_srgb(self.wiener(raw))
         return encoded + self.network(torch.cat([encoded, linear_to_srgb(raw)], dim=1))
+
+
+class FixedGeneral(nn.Module):
+    """A `GeneralRestoration` for images of one size, lens and noise, of real arithmetic alone.
+
+    Args:
+        network: one picture for all depths, `by_depth` false.
+        functions: point spread functions (D, 3, K, K) that it is given.
+        noise: (2,), likewise.
+        height: of the images, pixels.
+        width: of the images, pixels.
+    """
+
+    known: Tensor
+    pedestal: Tensor
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        network: GeneralRestoration,
+        functions: Tensor,
+        noise: Tensor,
+        height: int,
+        width: int,
+    ) -> None:
+        super().__init__()
+        functions, noise, dtype = functions.detach().double(), noise.double(), network.dtype
+        size = functions.shape[-1]
+        rows, columns = padded_lengths(height, width, size // 2, size)
+        matched, power = (c.expand(3, *c.shape) for c in correlations(functions, rows, columns))
+        weights = colour_filters(power, matched, noise_to_signal(noise), columns).flatten(0, 1)
+        self.filters = FilterMatrices(weights, columns, height, width, dtype)
+        nothing = functions.new_zeros(1, COLORS, 1, 1)
+        given = given_to_the_network(nothing, nothing[:, None], functions, noise)
+        self.register_buffer("known", given.known.to(dtype))
+        self.register_buffer("pedestal", given.pedestal.to(dtype))
+        self.network = network
+
+    def forward(self, raw: Tensor) -> Tensor:
+        """Restore (B, 3, height, width) linear light to sRGB."""
+        light = self.filters(raw).unflatten(1, (-1, COLORS))
+        pedestal = self.pedestal.expand(raw.shape[0])
+        images = Stabiliser(pedestal).forward(torch.cat([raw[:, None], light], dim=1))
+        known = self.known.expand(raw.shape[0], -1)
+        return self.network.restored(Prepared(images.flatten(1, 2), known, pedestal))
 
 
 def _matrices(length: int, frequencies: int) -> tuple[Tensor, Tensor]:

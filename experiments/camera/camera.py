@@ -124,10 +124,11 @@ class CameraModule(Camera):
             variables or {},
             reconstruction.view_norm,
         )
-        # No gradient passes it to a lens either.
-        self.trains = not isinstance(self.network, UntrainedRestoration)
+        learned = len(self.variables) or any(p.requires_grad for p in self.network.parameters())
+        # No gradient passes an untrained restorer to a lens either.
+        self.trains = bool(learned) and not isinstance(self.network, UntrainedRestoration)
         self.optimizer, self.scheduler = training.optimizer, training.scheduler
-        self.learning_rates = rates = training.learning_rates
+        self.learning_rates = rates = training.learning_rates.of(self.network)
         discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
         self.adversary = Adversary(discriminator, rate) if discriminator else None
         self.compiled = reconstruction.compiled

@@ -1,5 +1,6 @@
 """A camera's network as a module of tensors alone, and the sizes of images that it takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +11,17 @@ from torch.export import Dim
 from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import ImageNetwork
-from dolens.reconstruction import Restoration, WienerUNetRestoration
+from dolens.reconstruction import (
+    GeneralRestoration,
+    Restoration,
+    UntrainedRestoration,
+    WienerUNetRestoration,
+)
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
 from dolens.reconstruction.feature_wiener import DeconvolvedRestoration
 from dolens.reconstruction.nafnet import NAFNet
 from dolens.reconstruction.unet import UNet
-from dolens.reconstruction.wiener_matrices import FixedWienerUNet, with_fixed_filters
+from dolens.reconstruction.wiener_matrices import FixedGeneral, FixedWienerUNet, with_fixed_filters
 
 _RAW = (
     "the sensor image in linear light, (batch, 3, rows, columns), red, green and blue, the "
@@ -37,16 +43,19 @@ _TRACED = 256
 
 
 class _WithFunctions(nn.Module):
-    """A restoring network of the raw image alone: point spread functions are part of it."""
+    """A restoring network of the raw image alone: functions and noise are part of it."""
 
-    def __init__(self, network: Restoration, functions: Tensor | None) -> None:
+    def __init__(
+        self, network: Restoration, functions: Tensor | None, noise: Sequence[Tensor] = ()
+    ) -> None:
         super().__init__()
         self.network = network
         self.functions: Tensor | None
         self.register_buffer("functions", functions)
+        self.noise = list(noise)
 
     def forward(self, raw: Tensor) -> Tensor:
-        return self.network(raw, self.functions, None)
+        return self.network(raw, self.functions, None, *self.noise)
 
 
 class _WithField(nn.Module):
@@ -160,11 +169,13 @@ def exportable(
         raise InputError(f"image size {size}: allowed: {_MOST_PIXELS:.3g} pixels at most")
     if multiple is not None and multiple > _MOST:
         raise InputError(f"multiple of {multiple}: allowed: {_MOST} at most")
-    if camera.network.needs_noise:
+    if isinstance(camera.network, UntrainedRestoration):
         raise InputError(
             f"network: {type(camera.network).__name__} is no network of tensors alone, and is not "
             "exported"
         )
+    if getattr(camera.network, "by_depth", False):
+        raise InputError("network.by_depth: true; allowed in an exported network: false")
     network = camera.network.eval().requires_grad_(False).cpu()
     sensor = camera.views.sensor
     rows, columns = size or (sensor.height, sensor.width)
@@ -185,8 +196,12 @@ def exportable(
         rows, columns = (max(least, -(-side // multiple)) * multiple for side in (rows, columns))
     inputs = {"raw": _RAW, **({"field": _FIELD} if network.needs_field else {})}
     wrapper = _WithField if network.needs_field else _WithFunctions
-    module = real = wrapper(network, functions)
-    if isinstance(network, WienerUNetRestoration):
+    noise = camera.noise()
+    module = real = wrapper(network, functions, *([noise] if noise else []))
+    if isinstance(network, GeneralRestoration):
+        assert functions is not None  # it needs them
+        real = FixedGeneral(network, functions, *noise, rows, columns)
+    elif isinstance(network, WienerUNetRestoration):
         real = FixedWienerUNet(network, functions, rows, columns)
     elif isinstance(network, DeconvolvedRestoration):
         assert functions is not None  # it needs them

@@ -12,12 +12,14 @@ from torch import Tensor
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.camera.views.base import Views
 from dolens.experiments.experiment import Figures
 from dolens.optics.paraxial import first_order
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
 from dolens.plotting.layout import layout_title, lens_title, optics_text, shown_name
 from dolens.plotting.number_text import number_text
 from dolens.reconstruction import psnr_db
+from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities
 from dolens.sensor.colour import linear_to_srgb
 
 _PUPIL_SAMPLES = 96  # along each side of the pupil
@@ -58,6 +60,7 @@ def _images(
     with evaluating(camera.network):
         taken, functions = camera.take(camera.variables(), crops[stage], stage, 0)
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)
+        depths = _depths(camera, taken, functions)
     truth, raw, restored = (
         images.cpu()[0] for images in (taken.truth, linear_to_srgb(taken.raw), restored)
     )
@@ -71,7 +74,19 @@ def _images(
         title += f"\n(restored, mean over {count} photographs and all views: {mean:.2f} dB)"
     title += "\ndisplay-encoded (sRGB), clipped to [0, 1], not interpolated"
     labels = [_label(label) for label in camera.views.labels()]
-    return comparison_figure(truth, raw, restored, labels, quality, title)
+    return comparison_figure(truth, raw, restored, labels, quality, title, depths)
+
+
+def _depths(camera: Camera, taken: Views, functions: Tensor | None) -> dict[str, Tensor]:
+    """Return what a network that chooses by depth saw of it, (V, 3, H, W), by what it is called."""
+    views = camera.views
+    depths = getattr(views, "psf_depths", None) or views.scene.depths
+    chooses = getattr(camera.network, "by_depth", False) and len(depths) > 1
+    if not chooses or functions is None:
+        return {}
+    found = depth_probabilities(taken.raw[0], functions, *camera.noise())
+    name = f"depth, black {_metres(max(depths))}, white {_metres(min(depths))}"
+    return {name: depth_picture(found, depths).cpu()}
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """Settings of a camera's reconstruction and of its training."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import nn
 
 from dolens.experiments.camera.reconstruction import Loss
 from dolens.experiments.checks import check_positive
-from dolens.reconstruction import RelativisticDiscriminators
+from dolens.reconstruction import RelativisticDiscriminators, Restoration
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class LearningRates:
         optics: of the lens's variables, where its optimizer takes steps with the network's.
         network: of the network.
         discriminator: of the discriminators; None: the network's.
+        fine_tuning: of a network whose weights restore already; None: the network's.
 
     Raises:
         InputError: a rate that is not positive.
@@ -51,12 +52,19 @@ class LearningRates:
     optics: float
     network: float
     discriminator: float | None
+    # Run folders of old lack it.
+    fine_tuning: float | None = None
 
     def __post_init__(self) -> None:
-        for key in ("optics", "network", "discriminator"):
-            rate = getattr(self, key)
-            if key != "discriminator" or rate is not None:
+        for key, rate in vars(self).items():
+            if key in ("optics", "network") or rate is not None:
                 check_positive(f"learning_rates.{key}", rate)
+
+    def of(self, network: Restoration) -> "LearningRates":
+        """Return those with the rate that a network is to have as `network`."""
+        if self.fine_tuning is None or not network.restores_already:
+            return self
+        return replace(self, network=self.fine_tuning)
 
 
 @dataclass(frozen=True)

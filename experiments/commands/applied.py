@@ -148,7 +148,8 @@ def written(
     """Measure and write what a camera makes of a picture.
 
     Args:
-        images: truth, sensor and restored, each (3, H, W), display-encoded.
+        images: truth, sensor and restored, each (3, H, W), display-encoded, and the map of depths
+            if there is one.
         signal: what the sensor gave, (1 or 3, H, W).
         depth: of the picture, mm.
         name: that files begin with.
@@ -165,6 +166,9 @@ def written(
         metrics[f"{prefix}ssim"] = float(structural_similarity(image[None], truth[None].to(image)))
         files.append(folder / f"{name}_{kind}.{options.format}")
         write_picture(files[-1], image, options.bits)
+    if "depth" in images:
+        files.append(folder / f"{name}_depth.png")
+        write_picture(files[-1], images["depth"], 8)
     if options.save_raw:
         files.append(folder / f"{name}_raw.npy")
         np.save(files[-1], signal.permute(1, 2, 0).squeeze(-1).float().cpu().numpy())

@@ -23,6 +23,7 @@ from dolens.experiments.commands.apply_options import LensOptions
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
 from dolens.reconstruction import GeneralRestoration
+from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities
 from dolens.reconstruction.whole_pictures import restore_whole_picture
 from dolens.rendering.lens_camera import (
     colours_of,
@@ -132,14 +133,19 @@ class LensCamera:
     ) -> Applied:
         options = self.options
         signal = read_out(field.image(texture, number), self.readout, options.seed)
-        restored = restore_whole_picture(
-            self.restorer, signal, self.readout, field.functions, field.illumination, window
-        )
+        places = (signal, self.readout, field.functions, field.illumination, window)
         images = {
             "truth": linear_to_srgb(field.truth(texture, number)),
             "sensor": linear_to_srgb(self.readout.develop(signal)),
-            "restored": restored.clamp_(0.0, 1.0),
+            "restored": restore_whole_picture(self.restorer, *places).clamp_(0.0, 1.0),
         }
+        depths = field.imaging.scene.depths
+        if len(depths) > 1:
+
+            def look(raw: Tensor, functions: Tensor, _: None, noise: Tensor) -> Tensor:
+                return depth_picture(depth_probabilities(raw, functions, noise), depths)
+
+            images["depth"] = restore_whole_picture(look, *places)
         depth = self.depths()[number]
         files, metrics = written(images, signal, depth, name, folder, options)
         return Applied(name, files, metrics, self._mapping(field, window))

@@ -29,6 +29,7 @@ _RESOLVERS = {
     # The iterations of all stages together.
     "iterations": lambda stages: sum(stage["iterations"] for stage in stages),
     "count": len,
+    "given": bool,
     # The pixels on each side of the middle of a window with an odd number of them.
     "margin_of": lambda size: size // 2,
 }

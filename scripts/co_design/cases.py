@@ -23,6 +23,7 @@ _DEPTHS = (
     "reference_renderers=none",
     "miscalibrations=none",
     "data.batch_size=4",
+    "network=feature_wiener",
     *_SMALL,
 )
 # Windows of a large sensor, behind a network that knows where they lie.

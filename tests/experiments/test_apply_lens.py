@@ -104,6 +104,11 @@ def test_of_several_depths_the_restorer_is_told_all(work):
     record = json.loads((work / "double_gauss_applied/blocks.json").read_text())["images"]
     assert set(record) == {"blocks_3m", "blocks_infm"} and "3 │" in said
     assert record["blocks_3m"]["raw_psnr_db"] < record["blocks_infm"]["raw_psnr_db"]
+    near, far = (
+        np.asarray(Image.open(work / f"double_gauss_applied/blocks_{depth}_depth.png")).mean()
+        for depth in ("3m", "infm")
+    )
+    assert near > 170.0 and far < 85.0  # white is near, black is far
     camera = LensCamera(load_lens("double_gauss"), LensOptions(depths=(3000.0, float("inf"))))
     told = []
     camera.restorer = lambda raw, functions, field, noise: told.append(functions) or raw

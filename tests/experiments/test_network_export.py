@@ -19,6 +19,7 @@ from dolens.experiments.camera.reconstruction import restoration_of
 from dolens.reconstruction import (
     FeaturePyramidRestoration,
     FeatureWienerRestoration,
+    GeneralRestoration,
     NAFNetRestoration,
     UNetRestoration,
     WienerNAFNetRestoration,
@@ -37,6 +38,7 @@ def camera_of(network, size=(24, 20), functions=None):
         views=SimpleNamespace(sensor=sensor),
         variables=dict,
         functions=lambda values: functions,
+        noise=lambda: network.noise_arguments((0.01, 0.0009)),
     )
 
 
@@ -95,13 +97,14 @@ def test_deconvolution_by_matrices_is_that_by_fourier_transforms(blur):
         assert (found.real_module(raw) - found.module(raw)).abs().max() < 1e-11
 
 
-@pytest.mark.parametrize("kind", ["depths", "features", "nafnet"])
+@pytest.mark.parametrize("kind", ["depths", "features", "nafnet", "general"])
 def test_filters_that_mix_colours_are_exported_with_the_lens_built_in(kind, blur, tmp_path):
     nafnet = {"width": 2, "down": (1,), "up": (1,)}
     network = {
         "depths": lambda: FeatureWienerRestoration(width=2, depth=1, margin=4, depths=2),
         "features": lambda: FeatureWienerRestoration(2, 1, margin=4, features=2, scales=2),
         "nafnet": lambda: WienerNAFNetRestoration(**nafnet, margin=4),
+        "general": lambda: GeneralRestoration("none", width=4, down=(1,), middle=1, up=(1,)),
     }[kind]()
     found = exportable(camera_of(network.double(), (21, 16), blur.double()))
     raw = torch.rand(2, 3, 21, 16, dtype=torch.float64)

@@ -46,6 +46,26 @@ def test_deconvolving_networks_take_the_camera_s_functions(composed, name, coord
     torch.testing.assert_close(restored, linear_to_srgb(raw))
 
 
+@pytest.mark.parametrize(
+    ("experiment", "overrides", "held", "rate"),
+    [
+        ("wavefront_coding", [], True, 1e-4),
+        ("wavefront_coding", ["network.held=false"], False, 1e-4),
+        ("wavefront_coding_refocused", [], True, 1e-4),
+        ("wavefront_coding_baseline", [], False, 1e-4),  # nothing else is left to train
+        ("wavefront_coding", ["network.weights=none"], True, 0.002),
+        ("wavefront_coding", ["network=feature_wiener"], False, 0.002),
+    ],
+)
+def test_a_lens_is_learned_through_a_network_that_restores_already(
+    composed, experiment, overrides, held, rate
+):
+    cfg = composed(f"experiment={experiment}", *overrides)
+    network = instantiate(cfg.network)
+    assert held is not any(p.requires_grad for p in network.parameters())
+    assert instantiate(cfg.learning_rates).of(network).network == rate
+
+
 @pytest.mark.parametrize("name", ["restoration", "deblurgan"])
 def test_losses_weigh_their_terms_as_written(composed, name):
     cfg = composed(EXPERIMENT, f"loss={name}", "loss.perceptual=none", "loss.l1_weight=0.5")

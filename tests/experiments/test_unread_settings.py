@@ -29,7 +29,7 @@ UNREAD = {
 }
 READ = {
     "a group": ["network=unet"],
-    "keys within groups": ["network.depth=2", "evaluation_renderer.pupil_samples=2"],
+    "keys within groups": ["network.by_depth=true", "evaluation_renderer.pupil_samples=2"],
     "a key by way of another one": ["read_noise=0.01"],
     "an argument of a resolver": ["data.steps_per_epoch=7"],
     "a group without keys of its own": ["search=seeds"],

@@ -22,7 +22,7 @@ TINY = [
     "trainer.log_every_n_steps=1",
     "loss.perceptual=none",
 ]
-TINY_NETWORK = ["network.width=4", "network.depth=2"]
+TINY_NETWORK = ["network=feature_wiener", "network.width=4", "network.depth=2"]
 
 TINY_DOUBLET = [
     "experiment=large_fov_doublet",

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dolens.reconstruction import GeneralRestoration, psnr_db
-from dolens.reconstruction.depth_choice import depth_probabilities, picture_weights
+from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities, picture_weights
 from dolens.sensor.colour import linear_to_srgb
 from tests.reconstruction.test_untrained import blurred, disc
 
@@ -39,6 +39,13 @@ def test_each_half_has_its_own_depth():
     # The neighbourhoods that decide reach some 16 pixels across the border.
     assert float(found[0, :, :64].mean()) > 0.95
     assert float(found[1, :, 96:].mean()) > 0.95
+
+
+def test_a_picture_of_depths_has_vergence_as_its_grey():
+    certain = torch.eye(3)[:, :, None, None]  # three images of one pixel, each at one depth
+    grey = depth_picture(certain, [8000.0, 6000.0, 4000.0])[:, :, 0, 0]
+    nearness = torch.tensor([0.0, (1 / 6 - 1 / 8) / (1 / 4 - 1 / 8), 1.0])
+    assert torch.allclose(grey, nearness[:, None].expand(3, 3), atol=1e-6)
 
 
 def test_less_light_is_less_certain():
