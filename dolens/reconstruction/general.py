@@ -214,7 +214,8 @@ class GeneralRestoration(Restoration):
         up: blocks of each stage on the way up.
 
     Raises:
-        InputError: a number out of range, or a file that holds no weights of these widths.
+        InputError: a number out of range, a file that holds no weights of these widths, or none
+            that are held.
     """
 
     needs_point_spread_function: ClassVar[bool] = True
@@ -231,6 +232,8 @@ class GeneralRestoration(Restoration):
         up: Sequence[int] = (2, 2, 2),
     ) -> None:
         super().__init__()
+        if held and weights == "none":
+            raise InputError("network.held: true; allowed with network.weights=none: false")
         self.network = NAFNet(
             IMAGES,
             COLORS,

@@ -175,3 +175,8 @@ def test_a_file_that_holds_no_weights_is_refused_in_one_line(tmp_path, capsys, c
 def test_it_needs_the_lens_and_the_noise():
     with pytest.raises(InputError, match="point spread functions and the sensor's noise"):
         untrained(width=8)(torch.zeros(1, 3, 16, 16), SHARP)
+
+
+def test_weights_that_nothing_trained_are_not_held():
+    with pytest.raises(InputError, match="network.held: true; allowed with network.weights=none"):
+        untrained(held=True)
