@@ -121,7 +121,8 @@ class Evaluation:
                 ]
         if hasattr(camera.network, "filtered"):
             found += [f"test{judge}/linear_psnr_db{view}" for judge in judges for view in views]
-        rivals = [f"{name}_{score}" for name in rival_names() for score in ("psnr_db", "ssim")]
+        names = rival_names(camera.views.sensor)
+        rivals = [f"{name}_{score}" for name in names for score in ("psnr_db", "ssim")]
         found += [f"test/{name}{view}" for name in rivals for view in views]
         if camera.network.needs_point_spread_function:
             wrong = [f"psnr_db_miscalibrated/{kind}" for kind in self.miscalibrations]

@@ -9,18 +9,22 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.views.base import Views
 from dolens.reconstruction import WienerBM3DRestoration, WienerTVRestoration
 from dolens.reconstruction.untrained import bm3d_is_installed
+from dolens.sensor.pixels import Sensor
 
 # By what names of scores begin with, and what these restorers are called.
 RIVALS = {
     "tv": "Wiener's filter and total variation, which nothing has trained",
     "bm3d": "Wiener's filter and BM3D, which nothing has trained",
 }
+# Pixels along each side: on smaller images the package bm3d may end the whole program.
+_LEAST_BM3D = 32
 _MADE = {"tv": WienerTVRestoration, "bm3d": WienerBM3DRestoration}
 
 
-def rival_names() -> list[str]:
-    """Return the keys of `RIVALS` that this installation has."""
-    return [name for name in RIVALS if name != "bm3d" or bm3d_is_installed()]
+def rival_names(sensor: Sensor) -> list[str]:
+    """Return the keys of `RIVALS` that this installation has, for images of a sensor's size."""
+    small = min(sensor.height, sensor.width) < _LEAST_BM3D
+    return [name for name in RIVALS if name != "bm3d" or (bm3d_is_installed() and not small)]
 
 
 @torch.no_grad()
@@ -40,7 +44,7 @@ def restored_by_rivals(
     """
     if functions is None:
         functions = camera.views.point_spread_functions(camera.lens, values)
-    rivals = {name: _MADE[name]() for name in rival_names()}
+    rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
     noise = torch.tensor(camera.views.readout.noise)
     views = range(taken.raw.shape[1])
     of_view = [functions[v : v + 1] if camera.views.view_is_known else functions for v in views]
