@@ -175,3 +175,19 @@ def test_a_file_that_holds_no_weights_is_refused_in_one_line(tmp_path, capsys, c
 def test_it_needs_the_lens_and_the_noise():
     with pytest.raises(InputError, match="point spread functions and the sensor's noise"):
         untrained(width=8)(torch.zeros(1, 3, 16, 16), SHARP)
+
+
+@pytest.mark.parametrize("restorer", [GeneralRestoration(by_depth=True), WienerTVRestoration()])
+@pytest.mark.parametrize("depths", [1, 2])
+def test_an_image_with_functions_of_its_own_is_restored_as_by_itself(restorer, depths):
+    functions = torch.stack(
+        [torch.cat([disc(9, w), disc(9, w + 2.0)])[:depths] for w in (1.0, 3.0)]
+    )
+    raw = torch.stack([sensed(steps(), own[:1]) for own in functions])
+    with torch.no_grad():
+        together = restorer(raw, functions, None, NOISE)
+        alone = [restorer(r[None], f, None, NOISE) for r, f in zip(raw, functions, strict=True)]
+    assert torch.allclose(together, torch.cat(alone), atol=1e-5)
+    assert (together[0] - together[1]).abs().max() > 0.1
+    with pytest.raises(InputError, match=r"\(depths, 3, K, K\), or \(2, depths, 3, K, K\)"):
+        restorer(raw, functions[:1], None, NOISE)
