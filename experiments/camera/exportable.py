@@ -160,10 +160,10 @@ def exportable(
         raise InputError(f"image size {size}: allowed: {_MOST_PIXELS:.3g} pixels at most")
     if multiple is not None and multiple > _MOST:
         raise InputError(f"multiple of {multiple}: allowed: {_MOST} at most")
-    if camera.network.needs_noise:
+    if camera.network.needs_noise or camera.knows_places:
         raise InputError(
-            f"network: {type(camera.network).__name__} is no network of tensors alone, and is not "
-            "exported"
+            f"network: {type(camera.network).__name__} is told noise or places, is no network of "
+            "tensors alone, and is not exported"
         )
     network = camera.network.eval().requires_grad_(False).cpu()
     sensor = camera.views.sensor
@@ -175,8 +175,7 @@ def exportable(
     functions = None
     if network.needs_point_spread_function:
         with torch.no_grad():
-            functions = camera.functions(camera.variables())
-        assert functions is not None
+            functions = camera.views.point_spread_functions(camera.lens, camera.variables())
         functions = functions.detach().cpu().to(network.dtype)
     if multiple is not None:
         if size is None:
