@@ -170,11 +170,9 @@ def apply(
         folder, camera, found = module.apply_run(
             run_or_lens, pictures, chosen, checkpoint or "last", out, trust
         )
-        where = "whole pictures" if camera.margin is None else f"windows of {camera.window} pixels"
-        beside = "" if camera.margin is None else f" and {camera.margin} around them"
         typer.echo(
             f"{camera.run.experiment}, checkpoint of {camera.run.step} steps; restored in "
-            f"{where}{beside}"
+            f"{camera.where}"
         )
     else:
         _refuse(of_runs, f"{run_or_lens} is no run folder but a lens")

@@ -23,6 +23,7 @@ from dolens.reconstruction.opponent_wiener import (
     check_functions,
     colour_filters,
     correlations,
+    functions_of_each,
     over_depths,
     solve_in_opponent_colours,
 )
@@ -190,6 +191,17 @@ def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Ten
     )
 
 
+def prepared_with(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
+    """Return what the network is given of images with functions (D, 3, K, K) of all of them, or
+    (B, D, 3, K, K), of each its own.
+    """
+    if functions.ndim == 4:
+        return prepared(raw, functions, noise)
+    pairs = zip(raw.split(1), functions_of_each(raw, functions), strict=True)
+    parts = [prepared(image, own, noise) for image, own in pairs]
+    return Prepared(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
 class GeneralRestoration(Restoration):
     """Restore images of any lens by a network that has been told the lens and the noise.
 
@@ -220,6 +232,7 @@ class GeneralRestoration(Restoration):
 
     needs_point_spread_function: ClassVar[bool] = True
     needs_noise: ClassVar[bool] = True
+    takes_functions_of_images: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -286,12 +299,14 @@ class GeneralRestoration(Restoration):
         """
         functions, noise = self.functions_and_noise(point_spread_functions, noise)
         raw = raw.to(self.dtype)
-        common = self.restored(prepared(raw, functions, noise))
-        if not self.by_depth or len(functions) == 1:
+        common = self.restored(prepared_with(raw, functions, noise))
+        if not self.by_depth or functions.shape[-4] == 1:
             return common
-        own = [self.restored(prepared(raw, f[None], noise)) for f in functions]
-        shares = picture_weights(depth_probabilities(raw, functions, noise))
-        return (shares[:, :, None] * torch.stack([*own, common], dim=1)).sum(dim=1)
+        own = [self.restored(prepared_with(raw, f, noise)) for f in functions.split(1, dim=-4)]
+        pairs = zip(raw.split(1), functions_of_each(raw, functions), strict=True)
+        depths = torch.cat([depth_probabilities(image, f, noise) for image, f in pairs])
+        pictures = torch.stack([*own, common], dim=1)
+        return (picture_weights(depths)[:, :, None] * pictures).sum(dim=1)
 
     def restored(self, given: Prepared) -> Tensor:
         """Return the picture (B, 3, H, W), sRGB-encoded, of what is prepared."""

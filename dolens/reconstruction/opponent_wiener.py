@@ -188,6 +188,28 @@ def check_functions(functions: Tensor, depths: int | None = None) -> None:
         )
 
 
+def functions_of_each(images: Tensor, functions: Tensor) -> Sequence[Tensor]:
+    """Return the point spread functions (D, 3, K, K) of each of B images.
+
+    Args:
+        images: (B, ...).
+        functions: (D, 3, K, K) of all images, or (B, D, 3, K, K).
+
+    Raises:
+        InputError: functions of another shape.
+    """
+    if functions.ndim == 4:
+        functions = functions.expand(len(images), *functions.shape)
+    if functions.ndim != 5 or len(functions) != len(images):
+        raise InputError(
+            f"point_spread_functions of shape {tuple(functions.shape)}: expected "
+            f"(depths, 3, K, K), or ({len(images)}, depths, 3, K, K), of each image"
+        )
+    for own in functions:
+        check_functions(own)
+    return functions.unbind()
+
+
 def correlations(functions: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
     """Return mean H* and mean |H|² over the depths, each (3, rows, columns // 2 + 1).
 

@@ -28,13 +28,15 @@ class Restoration(nn.Module):
     `needs_point_spread_function` and `needs_field` tell the caller whether to compute the point
     spread functions and the field coordinates at all; where one is False they are ignored and
     may be None.  Where `needs_noise` is True, `forward` takes the sensor's noise besides, (2,): its
-    variance at light x is noise[0]·x + noise[1].  `pretrained` tells whether any of the network
-    began with trained weights, `restores_already` whether all of it did, for restoring pictures.
+    variance at light x is noise[0]·x + noise[1].  Where `takes_functions_of_images` is True, each
+    image may have functions of its own.  `pretrained` tells whether any of the network began with
+    trained weights, `restores_already` whether all of it did, for restoring pictures.
     """
 
     needs_point_spread_function: ClassVar[bool] = False
     needs_field: bool = False
     needs_noise: ClassVar[bool] = False
+    takes_functions_of_images: ClassVar[bool] = False
     pretrained: bool = False
     restores_already: bool = False
 
@@ -49,7 +51,8 @@ class Restoration(nn.Module):
         Args:
             raw: sensor image in linear light, (B, 3, H, W).
             point_spread_functions: (D, 3, K, K) for D depths, K odd, each centred on the pixel
-                (K//2, K//2) and of unit sum where the lens loses no light; or None.
+                (K//2, K//2) and of unit sum where the lens loses no light; of each image,
+                (B, D, 3, K, K), where the network takes such; or None.
             field: position of each pixel on the sensor, (B, 2, H, W): x and y over half the
                 sensor's diagonal, so that its corners have radius 1; or None.
 

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.reconstruction.opponent_wiener import (
-    check_functions,
     checked_ratios,
     colour_filters,
     correlations,
+    functions_of_each,
 )
 from dolens.reconstruction.restoration import Restoration
 from dolens.reconstruction.variance_stabilising import VarianceStabiliser
@@ -58,6 +58,7 @@ class UntrainedRestoration(Restoration):
 
     needs_point_spread_function: ClassVar[bool] = True
     needs_noise: ClassVar[bool] = True
+    takes_functions_of_images: ClassVar[bool] = True
 
     def __init__(self, noise_to_signal: Sequence[float]) -> None:
         super().__init__()
@@ -87,9 +88,9 @@ class UntrainedRestoration(Restoration):
             InputError: `point_spread_functions` or `noise` is None, or of another shape.
         """
         functions, noise = self.functions_and_noise(point_spread_functions, noise)
-        check_functions(functions)
-        functions = functions.to(raw.device, self.dtype)
-        return torch.stack([self._restored(one, functions, noise) for one in raw.to(self.dtype)])
+        raw = raw.to(self.dtype)
+        pairs = zip(raw, functions_of_each(raw, functions.to(raw)), strict=True)
+        return torch.stack([self._restored(image, own, noise) for image, own in pairs])
 
     def _restored(self, raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor:
         shot, read = (float(value) for value in noise)

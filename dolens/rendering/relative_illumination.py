@@ -1,6 +1,7 @@
 """Relative illumination: how bright a white scene is over the sensor."""
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,6 +10,8 @@ from torch.nn import functional
 from dolens.analysis.ray_intercepts import uniform_pupil_points
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import pupil_rays, rim_rays
+from dolens.scene.texture import bilinear
+from dolens.sensor.pixels import Sensor
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.
 RADII, _SIDE = 65, 13
@@ -16,6 +19,8 @@ RADII, _SIDE = 65, 13
 _RIM_RADII, _RIM_SIDE = 4, 3
 # Through the pupil, for each of them and each wavelength.
 RAYS = 2048
+# Points along the longer side of a map of light.
+_MAP_POINTS = 129
 
 
 def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
@@ -77,3 +82,39 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
     return functional.interpolate(
         light[None], size=(height, width), mode="bicubic", align_corners=True
     )[0]
+
+
+class IlluminationMap(NamedTuple):
+    """An `IlluminationMap` has the relative illumination of a whole sensor, however large it is.
+
+    Attributes:
+        light: (C, h, w), at points evenly over the sensor; linear in between.
+        share: of a point's distance to the next in a pixel.
+        sensor: the pixels.
+    """
+
+    light: Tensor
+    share: float
+    sensor: Sensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, imaging: ImagingSystem) -> "IlluminationMap":
+        """Return the map of an imaging system's sensor; arguments as of `relative_illumination`."""
+        sensor = imaging.sensor
+        longer = max(sensor.height, sensor.width)
+        pitch = sensor.pixel_pitch * max(1.0, (longer - 1) / (_MAP_POINTS - 1))
+        share = sensor.pixel_pitch / pitch
+        height, width = (
+            math.ceil((s - 1) * share - 1e-9) + 1 for s in (sensor.height, sensor.width)
+        )
+        light = relative_illumination(imaging.on(Sensor(height, width, pitch)))
+        return cls(light.float(), share, sensor)
+
+    def __call__(self, rows: Tensor, columns: Tensor) -> Tensor:
+        """Return relative illumination at rows (N,) and columns (M,), pixels: (C, N, M)."""
+        sensor, (height, width) = self.sensor, self.light.shape[-2:]
+        down = (rows - 0.5 * (sensor.height - 1)) * self.share + 0.5 * (height - 1)
+        across = (columns - 0.5 * (sensor.width - 1)) * self.share + 0.5 * (width - 1)
+        grid = torch.meshgrid(down.to(self.light), across.to(self.light), indexing="ij")
+        return bilinear(self.light, *grid)

@@ -7,7 +7,7 @@ picture and its image themselves.
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -16,9 +16,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.diffraction.diffraction_limit import with_diffraction_limit
-from dolens.diffraction.pixel_integration import PixelWindow
-from dolens.diffraction.psf import wave_kernels
 from dolens.errors import InputError
 from dolens.optics.backend import cpu_kernels_serve, with_chosen_backend
 from dolens.optics.lens import Lens
@@ -28,32 +25,27 @@ from dolens.rendering.auto.survey import spread_pixels
 from dolens.rendering.chief_ray_map import ChiefRayMap, chief_ray_maps, fit_chief_ray_map
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patches import PatchLayout, patches
-from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
-from dolens.rendering.plane_points import PlanePoints, chief_ray_points, plane_points
-from dolens.rendering.psf_grid import (
-    FieldPointSpreadFunctions,
-    PointShare,
-    object_points,
-    sampled_disc,
-    splat_plane_points,
+from dolens.rendering.place_functions import (
+    SAMPLES,
+    IdealPlaces,
+    chief_ray_places,
+    place_functions,
 )
+from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
+from dolens.rendering.plane_points import chief_ray_points
+from dolens.rendering.psf_grid import FieldPointSpreadFunctions, PointShare
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import working_f_number
-from dolens.rendering.relative_illumination import relative_illumination
+from dolens.rendering.relative_illumination import IlluminationMap
 from dolens.scene.planar import PlanarScene, as_planes
-from dolens.scene.texture import bilinear, resized, texture_origin
+from dolens.scene.texture import resized, texture_origin
 from dolens.sensor.pixels import Sensor
 
 # RMS grey levels, of 255 in linear light, that images may be off.
 _TOLERANCE = 1.0
-# Pixels along each side of a cell, at most; points along the longer side of the map of light.
-_LARGEST_CELL, _LIGHT_POINTS = 512, 129
+# Pixels along each side of a cell, at most.
+_LARGEST_CELL = 512
 # Times the pinhole's picture that one may be which covers a sensor.
 _LARGEST_COVER = 3.0
-# Below this share of the axial light a function's shape says nothing.
-_DARK = 1e-3
-# Strata of the pupil along each side, at least, for functions by which pictures are restored.
-_SAMPLES = 48
 # Sides of windows that one function may serve, pixels, and RMS grey levels that it may be off
 # within one: by so much, restored pictures are off in bright light, and by less in noise.  Smaller
 # windows than the last are not worth their margins, nor are those that functions are wider than.
@@ -73,8 +65,7 @@ class WholeField:
         borders: rows and columns of the grid's nodes, whole pixels.
         distortion: the object points of the colours' chief rays; None: no polynomials fit them.
         registered: those of the middle wavelength, which pictures are restored to; likewise.
-        light: (3, h, w), relative illumination at points evenly over the sensor.
-        light_pitch: mm from one of these points to the next.
+        illumination: relative illumination at rows (N,) and columns (M,): (3, N, M).
     """
 
     imaging: ImagingSystem
@@ -82,8 +73,7 @@ class WholeField:
     borders: tuple[tuple[int, ...], tuple[int, ...]]
     distortion: ChiefRayMap | None
     registered: ChiefRayMap | None
-    light: Tensor
-    light_pitch: float
+    illumination: IlluminationMap
 
     @classmethod
     @torch.no_grad()
@@ -125,20 +115,14 @@ class WholeField:
         ]
         rows, columns = (_borders(s, n) for s, n in zip(sides, counts, strict=True))
         renderer = replace(renderer, fields=(len(rows), len(columns)))
-        longer = max(sides)
-        light_pitch = sensor.pixel_pitch * max(1.0, (longer - 1) / (_LIGHT_POINTS - 1))
-        share = sensor.pixel_pitch / light_pitch
-        height, width = (math.ceil((s - 1) * share - 1e-9) + 1 for s in sides)
         middle = exact.showing(as_planes(scene, wavelengths=(scene.middle_wavelength,)))
-        light = relative_illumination(exact.on(Sensor(height, width, light_pitch)))
         return cls(
             fast if found.dtype == torch.float32 else exact,
             renderer,
             (rows, columns),
             distortion,
             fit_chief_ray_map(middle),
-            light.float(),
-            light_pitch,
+            IlluminationMap.of(exact),
         )
 
     @property
@@ -238,15 +222,6 @@ class WholeField:
         return image
 
     @torch.no_grad()
-    def illumination(self, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return relative illumination at rows (N,) and columns (M,), pixels: (3, N, M)."""
-        share, sensor = self.sensor.pixel_pitch / self.light_pitch, self.sensor
-        down = (rows - 0.5 * (sensor.height - 1)) * share + 0.5 * (self.light.shape[-2] - 1)
-        across = (columns - 0.5 * (sensor.width - 1)) * share + 0.5 * (self.light.shape[-1] - 1)
-        grid = torch.meshgrid(down.to(self.light), across.to(self.light), indexing="ij")
-        return bilinear(self.light, *grid)
-
-    @torch.no_grad()
     def functions(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return point spread functions by which pictures are restored, (N, D, 3, K, K).
 
@@ -258,45 +233,16 @@ class WholeField:
             rows: (N,), pixels, with fractions or without.
             columns: (N,).
         """
-        imaging, scene, pitch = self.imaging, self.imaging.scene, self.sensor.pixel_pitch
         points = self.sensor.positions(rows.double(), columns.double())
-        centre, inverse = self._local_map(rows.double(), columns.double())
-        size = self._registered_size(centre, points)
-        if self.renderer.diffraction == "wave":
-            places = object_points(imaging, points, centre)
-            found = wave_kernels(imaging.system, *places, PixelWindow(pitch, size))
-            functions = found.reshape(len(rows), len(scene.depths), 3, size, size)
-        else:
-            samples = max(_SAMPLES, self.renderer.pupil_samples)
-            disc = sampled_disc(torch.zeros(1, dtype=torch.int64), samples, 0, imaging.system)
-            seen = plane_points(imaging, points, disc)
-            down, across = (s - c[..., None].to(s) for s, c in zip(seen[:2], centre, strict=True))
-            a, b, c, d = (m[..., None, None].to(down) for m in inverse)
-            moved = PlanePoints(a * down + b * across, c * down + d * across, seen.weight)
-            fused = cpu_kernels_serve(imaging.system)
-            functions = splat_plane_points(moved, size, fused).functions
-            if self.renderer.diffraction == "limit":
-                f_number = working_f_number(imaging.pupil, imaging.system.vertices[-1])
-                functions = with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
-        total = functions.sum((-2, -1), keepdim=True)
-        point = torch.zeros_like(functions[0, 0, 0])
-        point[size // 2, size // 2] = 1.0
-        return torch.where(total > _DARK, functions / total.clamp(min=_DARK), point)
+        ideal = chief_ray_places(self._middle(), points)
+        size = self._registered_size(ideal, points)
+        samples = max(SAMPLES, self.renderer.pupil_samples)
+        diffraction = self.renderer.diffraction
+        return place_functions(self.imaging, points, ideal, size, diffraction, samples).functions
 
     def window(self) -> int:
         """Return how many pixels along each side a function of their middle serves."""
-        pixels = spread_pixels(self.sensor, _COMPARED)
-        least = max(_WINDOWS[-1], self.renderer.size)
-        for side in (side for side in _WINDOWS if side > least):
-            middles = [
-                _middles(p, length, math.ceil(length / side))
-                for p, length in zip(pixels, (self.sensor.height, self.sensor.width), strict=True)
-            ]
-            rows, columns = (torch.cat(pair) for pair in zip(pixels, middles, strict=True))
-            own, other = self.functions(rows, columns).split(_COMPARED)
-            if float(grey_levels(own - other).square().mean().sqrt()) <= _OFF:
-                return side
-        return least
+        return window_side(self.functions, self.sensor, self.renderer.size)
 
     def _nodes(self, row: int, depth: int) -> FieldPointSpreadFunctions:
         """The functions of a row of nodes, in a plane: (nodes, 1, 3, K, K)."""
@@ -346,29 +292,36 @@ class WholeField:
         scene = self.imaging.scene
         return self.imaging.showing(as_planes(scene, wavelengths=(scene.middle_wavelength,)))
 
-    def _local_map(
-        self, rows: Tensor, columns: Tensor
-    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
-        """Object points of pixels, (N, D, 1) each, and the inverse of their derivative with respect
-        to rows and columns, (N, D) each: how far pixels lie apart where object points do by one.
-        """
-        shifts = torch.tensor([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]]).double()
-        down, across = (rows + shifts[:, :1]).reshape(-1), (columns + shifts[:, 1:]).reshape(-1)
-        points = self.sensor.positions(down, across)
-        found = [
-            p[..., 0].double().unflatten(0, (5, -1))
-            for p in chief_ray_points(self._middle(), points)
-        ]
-        (a, c), (b, d) = ([p[n] - p[n + 1] for p in found] for n in (1, 3))
-        determinant = a * d - b * c
-        inverse = d / determinant, -b / determinant, -c / determinant, a / determinant
-        return (found[0][0][..., None], found[1][0][..., None]), inverse
-
-    def _registered_size(self, centre: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]) -> int:
+    def _registered_size(self, ideal: IdealPlaces, points: tuple[Tensor, Tensor]) -> int:
         """Pixels along each side that hold the functions with their lateral colour."""
         own = chief_ray_points(self.imaging, points)
-        far = max(float((o - c).abs().max()) for o, c in zip(own, centre, strict=True))
+        far = max(
+            float((o - c[..., None]).abs().max()) for o, c in zip(own, ideal[:2], strict=True)
+        )
         return self.renderer.size + 2 * math.ceil(far)
+
+
+@torch.no_grad()
+def window_side(functions: Callable[[Tensor, Tensor], Tensor], sensor: Sensor, size: int) -> int:
+    """Return how many pixels along each side of a picture a function of their middle serves.
+
+    Args:
+        functions: at rows and columns (N,), pixels: (N, D, 3, K, K).
+        sensor: the whole one.
+        size: pixels that functions are wide; no window is smaller.
+    """
+    pixels = spread_pixels(sensor, _COMPARED)
+    least = max(_WINDOWS[-1], size)
+    for side in (side for side in _WINDOWS if side > least):
+        middles = [
+            _middles(p, length, math.ceil(length / side))
+            for p, length in zip(pixels, (sensor.height, sensor.width), strict=True)
+        ]
+        rows, columns = (torch.cat(pair) for pair in zip(pixels, middles, strict=True))
+        own, other = functions(rows, columns).split(_COMPARED)
+        if float(grey_levels(own - other).square().mean().sqrt()) <= _OFF:
+            return side
+    return least
 
 
 def _borders(length: int, count: int) -> tuple[int, ...]:

@@ -1,7 +1,7 @@
 """Cameras as built: each lens is off by its tolerances, and focused by an assembly line."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -171,18 +171,21 @@ class Manufacture:
             for errors in self.tolerances.draw(count, generator)
         ]
 
-    def functions(self, lens: Lens, design: Mapping[str, Tensor], made: MadeLens) -> Tensor:
-        """Return the point spread functions (views, 3, K, K) that a network is given.
+    def functions(
+        self,
+        told: Callable[[Mapping[str, Tensor]], Tensor | None],
+        design: Mapping[str, Tensor],
+        made: MadeLens,
+    ) -> Tensor | None:
+        """Return the point spread functions that a network is given of images of a made lens.
 
         Args:
-            lens: as drawn, with the parameters of the design.
-            design: its variables.
+            told: from a lens's values to functions that the camera's network would be given.
+            design: variables of the lens as drawn.
             made: the lens whose images it restores.
         """
-        if self.gives_the_design_s_functions:
-            return self._views.point_spread_functions(lens, design)
-        own = self._views.point_spread_functions(lens, made.values)
-        if self.settings.calibration == "own":
+        own = told(design if self.gives_the_design_s_functions else made.values)
+        if own is None or self.settings.calibration != "measured":
             return own
         generator = generator_of(_OFFSET + made.number)
         measured = noisy_point_spread_functions(

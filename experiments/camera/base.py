@@ -59,7 +59,13 @@ class Camera(Experiment):
             raise InputError(f"view_norm must be at least 1, not {view_norm}")
         self.view_norm = view_norm
         size = (views.sensor.height, views.sensor.width)
-        check_reconstruction(self.network, self.loss, size, len(views.psf_labels()))
+        functions = (1, 1) if self.knows_places else (len(views.psf_labels()),)
+        check_reconstruction(self.network, self.loss, size, functions)
+
+    @property
+    def knows_places(self) -> bool:
+        """Return whether the network is given the functions of each image's own place."""
+        return self.network.takes_functions_of_images and self.views.view_is_known
 
     def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
         """Return restored images (B, V, 3, H, W), display-encoded.
@@ -123,7 +129,7 @@ class Camera(Experiment):
             images = (self.lens, values, batch, stage, index, reference)
             # Views that know no shares are asked for none.
             taken = self.views.take(*images) if share is None else self.views.take(*images, share)
-            return taken, self.functions(values)
+            return taken, self.functions(values, taken, stage)
 
     def share_of_step(self, count: int, batch_idx: int) -> BatchShare | None:
         """Return which images of a step's batch these are: of all processes, and of all batches
@@ -150,11 +156,21 @@ class Camera(Experiment):
         """Compute without autocast within: optics and measures are never in half precision."""
         return torch.autocast(self.device.type, enabled=False)
 
-    def functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
-        """Return point spread functions (views, 3, K, K); None if the network asks for none."""
+    def functions(self, values: Mapping[str, Tensor], taken: Views, stage: str) -> Tensor | None:
+        """Return what the network is told of images: functions (views, 3, K, K) of all of them, or
+        (B·V, D, 3, K, K), of each its own; None if it asks for none.
+
+        Args:
+            values: the lens's variables.
+            taken: the images.
+            stage: that they were taken in.
+        """
         if not self.network.needs_point_spread_function:
             return None
-        return self.views.point_spread_functions(self.lens, values)
+        own = None
+        if self.knows_places:
+            own = self.views.functions_of_images(self.lens, values, taken, stage)
+        return self.views.point_spread_functions(self.lens, values) if own is None else own
 
     def comparison(self) -> Comparison | None:
         """Return the loss as a function of images, for a renderer that compares gradients.
@@ -165,7 +181,7 @@ class Camera(Experiment):
             return None
 
         def loss(taken: Views, values: Mapping[str, Tensor]) -> Tensor:
-            functions = self.functions(values)
+            functions = self.functions(values, taken, "train")
             # No statistics or dropout of its own may move while gradients are compared.
             with evaluating(self.network):
                 restored = self.restore(taken, functions)

@@ -124,12 +124,20 @@ class NoisyMeasurement:
         return noisy_point_spread_functions(exact, self.electrons, self.read_noise, same)
 
 
-def check(miscalibrations: Mapping[str, Miscalibration], lens: Lens) -> None:
+def check(
+    miscalibrations: Mapping[str, Miscalibration], lens: Lens, knows_places: bool = False
+) -> None:
     """Check that the tolerances of calibrations are parameters of the lens.
 
     Raises:
-        InputError: one is not.
+        InputError: one is not; or the network is told functions of each image's own place, which
+            calibrations do not make.
     """
+    if miscalibrations and knows_places:
+        raise InputError(
+            f"miscalibrations: {', '.join(miscalibrations)}; allowed with views of a field and a "
+            "network that is told the functions of each place: none"
+        )
     for calibration in miscalibrations.values():
         if isinstance(calibration, OtherSample):
             tolerances_from(lens, calibration.tolerances, calibration.factor)

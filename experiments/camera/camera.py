@@ -153,7 +153,7 @@ class CameraModule(Camera):
             getattr(self.optimizer, "lens_steps", None),
         )
         views.expose(self.lens)
-        check_miscalibrations(self.evaluation.miscalibrations, lens)
+        check_miscalibrations(self.evaluation.miscalibrations, lens, self.knows_places)
         self.manufacture = manufacture_of(as_built, tolerances, self.lens, views)
         if self.manufacture and self.manufacture.settings.desensitising and self.lens_steps.apart:
             raise InputError(

@@ -169,10 +169,10 @@ def exportable(
         raise InputError(f"image size {size}: allowed: {_MOST_PIXELS:.3g} pixels at most")
     if multiple is not None and multiple > _MOST:
         raise InputError(f"multiple of {multiple}: allowed: {_MOST} at most")
-    if isinstance(camera.network, UntrainedRestoration):
+    if isinstance(camera.network, UntrainedRestoration) or camera.knows_places:
         raise InputError(
-            f"network: {type(camera.network).__name__} is no network of tensors alone, and is not "
-            "exported"
+            f"network: {type(camera.network).__name__} is no network of tensors alone, or is "
+            "told the place of each image, and is not exported"
         )
     if getattr(camera.network, "by_depth", False):
         raise InputError("network.by_depth: true; allowed in an exported network: false")
@@ -186,8 +186,7 @@ def exportable(
     functions = None
     if network.needs_point_spread_function:
         with torch.no_grad():
-            functions = camera.functions(camera.variables())
-        assert functions is not None
+            functions = camera.views.point_spread_functions(camera.lens, camera.variables())
         functions = functions.detach().cpu().to(network.dtype)
     if multiple is not None:
         if size is None:

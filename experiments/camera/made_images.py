@@ -1,6 +1,7 @@
 """A batch is imaged through several lenses that were made, each with an equal part of it."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -76,12 +77,11 @@ def images_of_made_lenses(
         arguments = (camera.lens, made.values, part, "train", camera.global_step, None)
         # Views that know no shares are asked for none.
         taken.append(camera.views.take(*arguments) if alone else camera.views.take(*arguments, own))
-        if not camera.network.needs_point_spread_function:
-            functions.append(None)
-        elif functions and manufacture.gives_the_design_s_functions:
+        if functions and manufacture.gives_the_design_s_functions and not camera.knows_places:
             functions.append(functions[0])
-        else:
-            functions.append(manufacture.functions(camera.lens, design, made))
+            continue
+        told = partial(camera.functions, taken=taken[-1], stage="train")
+        functions.append(manufacture.functions(told, design, made))
     fields = [part.field for part in taken if part.field is not None]
     return (
         Views(

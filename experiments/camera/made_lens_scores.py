@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ from torch import Tensor
 from dolens.experiments.camera.as_built import Manufacture
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.camera.views.base import Views
 from dolens.experiments.tables import Row
 from dolens.plotting.made_lenses import made_lenses_figure
 from dolens.reconstruction import psnr_db
@@ -172,25 +174,29 @@ def made_lens_scores(
     design = camera.variables()
     started = time.perf_counter()
 
-    def scores(values: dict[str, Tensor], functions: Tensor | None) -> Tensor:
-        with camera.exact():
-            taken = judging.take(camera.lens, values, crops, "test", 0)
+    def taken_by(values: Mapping[str, Tensor]) -> Views:
+        return judging.take(camera.lens, values, crops, "test", 0)
+
+    def scores(taken: Views, functions: Tensor | None) -> Tensor:
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)
         truth = taken.truth.to(restored.dtype)
         found = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1))
         return found.unflatten(0, truth.shape[:2]).double().cpu()
 
     with evaluating(camera.network):
-        of_design = camera.functions(design)
-        as_drawn = scores(dict(design), of_design)
+        with camera.exact():
+            taken = taken_by(design)
+            of_design = camera.functions(design, taken, "train")
+        as_drawn = scores(taken, of_design)
         rows, errors = [], []
         for number in range(manufacture.settings.tested):
             with camera.exact():
                 made = manufacture.tested(camera.lens, design, number)
-                functions = of_design
-                if of_design is not None and not manufacture.gives_the_design_s_functions:
-                    functions = manufacture.functions(camera.lens, design, made)
-            rows.append(scores(made.values, functions))
+                taken, functions = taken_by(made.values), of_design
+                if not manufacture.gives_the_design_s_functions:
+                    told = partial(camera.functions, taken=taken, stage="train")
+                    functions = manufacture.functions(told, design, made)
+            rows.append(scores(taken, functions))
             errors.append(made.errors)
     seconds = (time.perf_counter() - started) / (len(rows) + 1)
     return MadeLensScores(

@@ -122,7 +122,7 @@ def loss_over_views(
 
 
 def check_reconstruction(
-    network: Restoration, loss: Loss, size: Sequence[int], functions: int
+    network: Restoration, loss: Loss, size: Sequence[int], functions: Sequence[int]
 ) -> None:
     """Try a network and a loss on one image before anything is trained.
 
@@ -132,7 +132,8 @@ def check_reconstruction(
         network: to be tried.
         loss: to be tried on its image.
         size: height and width of the camera's images, pixels.
-        functions: number of point spread functions that the camera gives.
+        functions: number of point spread functions that the camera gives; or 1 and their number,
+            where it gives each image its own.
 
     Raises:
         InputError: the network or the loss fails, or gives something else than is needed.
@@ -141,7 +142,7 @@ def check_reconstruction(
     raw = torch.zeros(1, 3, *size)
     psf = field = None
     if network.needs_point_spread_function:
-        psf = torch.zeros(functions, 3, 3, 3)
+        psf = torch.zeros(*functions, 3, 3, 3)
         psf[..., 1, 1] = 1.0
     if network.needs_field:
         field = torch.zeros(1, 2, *size)

@@ -66,6 +66,7 @@ def margin_of(
     functions: Tensor | None,
     device: torch.device,
     largest: int = _LARGEST_PROBE,
+    noise: Sequence[Tensor] = (),
 ) -> int | None:
     """Measure how far the network looks, in pixels, as a multiple of `GRID`.
 
@@ -74,6 +75,7 @@ def margin_of(
         functions: point spread functions (D, 3, K, K), where the network asks for them.
         device: of both.
         largest: side of the largest probe image, pixels.
+        noise: of the sensor, where the network asks for it; see `Camera.noise`.
 
     Returns:
         The margin; None where the network looks farther than half the largest probe, as one does
@@ -83,7 +85,7 @@ def margin_of(
         return None
     size = _FIRST_PROBE
     while size <= largest:
-        reach = _reach(network, functions, size, device)
+        reach = _reach(network, functions, size, device, noise)
         # Near the probe's edge less is seen than there would be.
         if reach < size // 2 - GRID // 2:
             return max(GRID, GRID * math.ceil(reach / GRID))
@@ -91,7 +93,13 @@ def margin_of(
     return None
 
 
-def _reach(network: Restoration, functions: Tensor | None, size: int, device: torch.device) -> int:
+def _reach(
+    network: Restoration,
+    functions: Tensor | None,
+    size: int,
+    device: torch.device,
+    noise: Sequence[Tensor],
+) -> int:
     """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones."""
     # In double precision: rounding in a transform would look like an influence of all pixels.
     network = copy.deepcopy(network).double()
@@ -102,7 +110,7 @@ def _reach(network: Restoration, functions: Tensor | None, size: int, device: to
     functions = None if functions is None else functions.double()
     middle, farthest = size // 2, 0
     with evaluating(network), torch.enable_grad():
-        restored = network(raw, functions, field)
+        restored = network(raw, functions, field, *noise)
         for down, across in _LOOKED_AT:
             row, column = middle + down, middle + across
             (gradient,) = torch.autograd.grad(

@@ -33,22 +33,25 @@ def restored_by_rivals(
 ) -> dict[str, Tensor]:
     """Return images (B, V, 3, H, W), display-encoded, by the name of who restored them.
 
-    They know what a network may know: the sensor's noise and the point spread functions of all
-    views, or of each its own where a camera knows which view an image is.
+    They know what a network may know: the sensor's noise, and the point spread functions of each
+    image's own place where a camera knows it, else of all views.
 
     Args:
         camera: whose images they are.
         taken: what the sensor gave.
-        functions: point spread functions; None where the camera's network asks for none.
+        functions: that the camera's network was told; None where it asks for none.
         values: of the lens's variables.
     """
+    if functions is None or functions.ndim == 4:  # not yet of each image its own
+        own = camera.views.functions_of_images(camera.lens, values, taken, "test")
+        functions = functions if own is None else own
     if functions is None:
         functions = camera.views.point_spread_functions(camera.lens, values)
     rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
     noise = torch.tensor(camera.views.readout.noise)
-    views = range(taken.raw.shape[1])
-    of_view = [functions[v : v + 1] if camera.views.view_is_known else functions for v in views]
     return {
-        name: torch.stack([rival(taken.raw[:, v], of_view[v], None, noise) for v in views], dim=1)
+        name: rival(taken.raw.flatten(0, 1), functions, None, noise).unflatten(
+            0, taken.raw.shape[:2]
+        )
         for name, rival in rivals.items()
     }

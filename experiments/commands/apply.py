@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.camera.restored_windows import (
     DEFAULT_WINDOW,
     margin_of,
@@ -30,6 +31,7 @@ from dolens.experiments.commands.picture_files import read_array, write_picture
 from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
+from dolens.reconstruction.whole_pictures import restore_whole_picture
 from dolens.sensor.colour import linear_to_srgb
 
 logger = logging.getLogger(__name__)
@@ -43,10 +45,11 @@ class PictureCamera:
         options: see `Options`.
 
     Attributes:
-        margin: pixels that the network looks beyond a window; None: it sees whole pictures.
+        margin: pixels that the network looks beyond a window; None: it sees whole pictures, or is
+            told the functions of windows' own places.
 
     Raises:
-        InputError: the run is of no camera.
+        InputError: the run is of no camera, or its network cannot restore by place.
     """
 
     def __init__(self, run: FinishedRun, options: Options) -> None:
@@ -57,23 +60,49 @@ class PictureCamera:
             )
         self.run, self.options = run, options
         self.camera: Camera = run.module
+        if self.camera.knows_places and not self.camera.network.needs_noise:
+            raise InputError(
+                f"network: {type(self.camera.network).__name__} takes no noise, with which "
+                "pictures of a field are restored by place"
+            )
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.camera.to(device)
         self.device = device
         with torch.no_grad():
             self.values = {n: v.detach() for n, v in self.camera.variables().items()}
-            self.functions = self.camera.functions(self.values)
-        self.margin = margin_of(self.camera.network, self.functions, device)
+            self.functions = self._functions()
+        self.margin: int | None = None
+        self._chosen = DEFAULT_WINDOW  # by place for the last picture
+        if self.camera.knows_places:
+            return
+        noise = self.camera.noise()
+        self.margin = margin_of(self.camera.network, self.functions, device, noise=noise)
         if self.margin is None:
             logger.warning(
                 "The network looks farther than 200 pixels around each, or one cannot tell: "
                 "pictures are restored as a whole"
             )
 
+    def _functions(self) -> Tensor | None:
+        """The functions that are told of all pictures, where the network asks for any."""
+        network, views = self.camera.network, self.camera.views
+        if not network.needs_point_spread_function or self.camera.knows_places:
+            return None
+        return views.point_spread_functions(self.camera.lens, self.values)
+
     @property
     def window(self) -> int:
         """Pixels along each side of what is restored at once."""
-        return self.options.window or DEFAULT_WINDOW
+        return self.options.window or self._chosen
+
+    @property
+    def where(self) -> str:
+        """What pictures are restored in, in words."""
+        if self.camera.knows_places:
+            return f"windows of {self.window} pixels, each by the function of its place"
+        if self.margin is None:
+            return "whole pictures"
+        return f"windows of {self.window} pixels and {self.margin} around them"
 
     def depths(self) -> list[float]:
         """The depths that pictures are put at, mm."""
@@ -99,11 +128,10 @@ class PictureCamera:
         generator = torch.Generator(taken.image.device).manual_seed(options.seed)
         with torch.no_grad():
             signal = views.readout(taken.image, generator)
-            raw = views.readout.develop(signal)
         images = {
             "truth": taken.truth[0],
-            "sensor": linear_to_srgb(raw)[0],
-            "restored": self._restored(raw, taken.field)[0],
+            "sensor": linear_to_srgb(views.readout.develop(signal))[0],
+            "restored": self._restored(signal, taken.field, placing),
         }
         files, metrics = written(images, signal[0], depth, name, folder, options)
         return Applied(name, files, metrics, taken.mapping)
@@ -118,25 +146,33 @@ class PictureCamera:
         check_size(file, array.shape[:2])
         readout = self.camera.views.readout
         signal = signal_of(array, readout, file, self.options.black_level, self.options.white_level)
-        raw = readout.develop(signal.to(self.device))
-        field = self.camera.views.field_of(*raw.shape[-2:])
-        restored = self._restored(raw, None if field is None else field[None].to(raw))
+        signal = signal.to(self.device)
+        height, width = signal.shape[-2:]
+        field = self.camera.views.field_of(height, width)
+        restored = self._restored(signal, None if field is None else field[None].to(signal))
         path = folder / f"{file.stem}_restored.{self.options.format}"
-        write_picture(path, restored[0], self.options.bits)
-        mapping = f"{raw.shape[-1]}×{raw.shape[-2]} raw pixels, taken from the middle of the sensor"
+        write_picture(path, restored, self.options.bits)
+        mapping = f"{width}×{height} raw pixels, taken from the middle of the sensor"
         return [Applied(file.stem, (path,), {}, mapping)]
 
-    def _restored(self, raw: Tensor, field: Tensor | None) -> Tensor:
-        found = restore_in_windows(
-            self.camera.network,
-            raw,
-            self.functions,
-            field,
-            self.window,
-            self.margin,
-            self.camera.noise(),
-        )
-        return found.clamp(0.0, 1.0)
+    def _restored(
+        self, signal: Tensor, field: Tensor | None, placing: Placing | None = None
+    ) -> Tensor:
+        """The picture (3, H, W) of a signal (1, C, H, W), display-encoded."""
+        camera, readout = self.camera, self.camera.views.readout
+        if camera.knows_places:
+            size = (signal.shape[-2], signal.shape[-1])
+            known = camera.views.by_place(camera.lens, self.values, size, placing)
+            assert known is not None  # as the camera knows places
+            self._chosen = known.window
+            told = (known.functions, known.illumination, self.window)
+            with evaluating(camera.network):
+                found = restore_whole_picture(camera.network, signal[0], readout, *told)
+            return found.clamp(0.0, 1.0)
+        raw = readout.develop(signal)
+        settings = (self.window, self.margin, camera.noise())
+        found = restore_in_windows(camera.network, raw, self.functions, field, *settings)
+        return found[0].clamp(0.0, 1.0)
 
     def record(self) -> dict[str, Any]:
         """Return what is true of all pictures, for their records."""

@@ -52,7 +52,7 @@ def _loss(module: torch.nn.Module) -> Loss:
     def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
         every = {**{n: p.detach() for n, p in module.variables().items()}, **values}
         taken = module.views.take(module.lens, every, textures, "train", seed)
-        functions = module.functions(every)
+        functions = module.functions(every, taken, "train")
         restored = module.restore(taken, functions)
         terms = module.loss_over_views(restored, taken.truth.to(restored.dtype))
         return terms["total"]

@@ -19,7 +19,7 @@ from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.picture_files import read_array, read_picture, write_picture
 from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import load_run
-from dolens.reconstruction import UNetRestoration, WienerUNetRestoration
+from dolens.reconstruction import GeneralRestoration, UNetRestoration, WienerUNetRestoration
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
 from dolens.sensor.pixels import Sensor
@@ -61,6 +61,18 @@ def test_a_restored_picture_does_not_depend_on_its_windows(network):
     )
     assert (some - whole).abs().max() < 1e-4 and (many - whole).abs().max() < 1e-4
     assert (whole - linear_to_srgb(raw)).abs().max() > 0.1  # it is no identity
+
+
+def test_a_network_that_is_told_the_noise_has_a_margin_too():
+    network = GeneralRestoration(weights="none", width=8, down=(1,), middle=1, up=(1,))
+    raw, noise = torch.rand(1, 3, 100, 300), [torch.tensor([0.01, 0.0009])]
+    margin = margin_of(network, blur(), CPU, noise=noise)
+    assert margin is not None
+    whole, parts = (
+        restore_in_windows(network, raw, blur(), None, window, margin, noise)
+        for window in (512, 128)
+    )
+    assert (whole - parts).abs().max() < 1e-4
 
 
 def test_windows_keep_every_pixel_once():

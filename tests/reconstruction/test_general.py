@@ -180,3 +180,19 @@ def test_it_needs_the_lens_and_the_noise():
 def test_weights_that_nothing_trained_are_not_held():
     with pytest.raises(InputError, match=r"network\.held: true; allowed with"):
         untrained(held=True)
+
+
+@pytest.mark.parametrize("restorer", [GeneralRestoration(by_depth=True), WienerTVRestoration()])
+@pytest.mark.parametrize("depths", [1, 2])
+def test_an_image_with_functions_of_its_own_is_restored_as_by_itself(restorer, depths):
+    functions = torch.stack(
+        [torch.cat([disc(9, w), disc(9, w + 2.0)])[:depths] for w in (1.0, 3.0)]
+    )
+    raw = torch.stack([sensed(steps(), own[:1]) for own in functions])
+    with torch.no_grad():
+        together = restorer(raw, functions, None, NOISE)
+        alone = [restorer(r[None], f, None, NOISE) for r, f in zip(raw, functions, strict=True)]
+    assert torch.allclose(together, torch.cat(alone), atol=1e-5)
+    assert (together[0] - together[1]).abs().max() > 0.1
+    with pytest.raises(InputError, match=r"\(depths, 3, K, K\), or \(2, depths, 3, K, K\)"):
+        restorer(raw, functions[:1], None, NOISE)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.experiments.camera.views.whole import Placing, WholePicture
+from dolens.experiments.camera.views.whole import ByPlace, Placing, WholePicture
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
@@ -31,8 +31,8 @@ class Views(NamedTuple):
     Attributes:
         truth: (B, V, 3, H, W), display-encoded: what an ideal camera would have taken.
         raw: (B, V, 3, H, W), linear light, read out and developed.
-        field: (B, V, 2, H, W), where each pixel lies on the sensor, x and y over half its diagonal;
-            None where that is the same for all.
+        field: (B, V, 2, H, W), where each pixel lies on the sensor, x and y over half its diagonal,
+            by which functions of each image are found; None where that is the same for all.
     """
 
     truth: Tensor
@@ -147,6 +147,25 @@ class Imaging(ABC):
         K is the views' own number of pixels, or the odd one that is given as `size`.
         """
 
+    def functions_of_images(
+        self, lens: Lens, values: Mapping[str, Tensor], taken: Views, stage: str
+    ) -> Tensor | None:
+        """Return the point spread functions of each image's own place, (B·V, D, 3, K, K).
+
+        I(p) = Σ PSF(e) · S(p - e) in the sensor's pixels, with S the truth in linear light.  Their
+        sums are relative illuminations.  Differentiable in the values.
+
+        Args:
+            lens: the lens.
+            values: its variables.
+            taken: the images.
+            stage: that they were taken in, whose renderer says how diffraction is modelled.
+
+        Returns:
+            Texture after texture; None where a camera does not know which view an image is.
+        """
+        return None
+
     @abstractmethod
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
@@ -168,6 +187,23 @@ class Imaging(ABC):
             InputError: the views image no whole pictures.
         """
         raise InputError(f"views: {type(self).__name__} images no whole pictures")
+
+    def by_place(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        size: tuple[int, int],
+        placing: Placing | None = None,
+    ) -> ByPlace | None:
+        """Return what restores a whole picture by place, where cameras know the place.
+
+        Args:
+            lens: the lens.
+            values: its variables.
+            size: height and width of the picture on the sensor, pixels.
+            placing: how it was put in front of the camera; None: as in training.
+        """
+        return None
 
     def field_of(self, height: int, width: int) -> Tensor | None:
         """Where each pixel of an image about the middle of the sensor lies, (2, H, W), x and y over

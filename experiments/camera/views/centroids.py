@@ -32,28 +32,51 @@ def reference_centroid_map(
     Coma puts the centroid of a spot beside its chief ray; images of a target, by which distortion
     is calibrated, show the centroid.  Arguments and returns as of `reference_chief_ray_map`.
     """
+    found = reference_chief_ray_map(lens, values, scene, whole, windows)
+    moves = centroid_moves(lens, values, scene, whole, _middles(windows))
+    return [
+        (rows + down[:, None, None], columns + across[:, None, None])
+        for (rows, columns), down, across in zip(found, *moves, strict=True)
+    ]
+
+
+def centroid_moves(
+    lens: Lens,
+    values: Mapping[str, Tensor],
+    scene: Scene,
+    whole: Sensor,
+    points: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Return by how much the centroids of the light at points of the sensor lie beside the chief
+    rays, at the reference wavelength.
+
+    Args:
+        lens: as of `reference_chief_ray_map`, and the others.
+        values: the lens's variables.
+        scene: D planes.
+        whole: the sensor.
+        points: x and y, mm, each (N,), double precision.
+
+    Returns:
+        Rows and columns in the image of a pinhole, each (N, D), in double precision.
+    """
     system = lens.system(values)
     wavelengths = (lens.primary_wavelength,)
     planes = as_planes(scene, wavelengths=wavelengths)
-    with torch.no_grad():
-        pupil = sampled_exit_pupil(system, wavelengths, whole)
+    pupil = sampled_exit_pupil(system, wavelengths, whole)
     pupil = differentiable_exit_pupil(system, wavelengths, pupil)
     imaging = ImagingSystem(system, planes, whole, pupil)
-    points = _middles(windows)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _SAMPLES, None, system)
     seen = plane_points(imaging, points, disc)
     weight = seen.weight.expand(seen.rows.shape)
     share = weight / weight.sum(-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
-    chief = chief_ray_points(imaging, points)
-    moves = [
-        ((share * places).sum(-1).double() - centre)[:, :, 0, None, None]
-        for places, centre in zip((seen.rows, seen.columns), chief, strict=True)
-    ]
-    found = reference_chief_ray_map(lens, values, scene, whole, windows)
-    return [
-        (rows + down, columns + across)
-        for (rows, columns), down, across in zip(found, *moves, strict=True)
-    ]
+    down, across = (
+        ((share * places).sum(-1).double() - centre)[:, :, 0]
+        for places, centre in zip(
+            (seen.rows, seen.columns), chief_ray_points(imaging, points), strict=True
+        )
+    )
+    return down, across
 
 
 def _middles(windows: Sequence[Sensor]) -> tuple[Tensor, Tensor]:

@@ -36,6 +36,11 @@ class FieldWindows:
         self.height, self.width = height, width
         self.training_windows = training_windows
 
+    @property
+    def half_diagonal(self) -> float:
+        """Half of the whole sensor's diagonal, mm."""
+        return 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+
     def training(self, generator: torch.Generator) -> Sensor:
         """A window to train on."""
         if self.training_windows == "area":
@@ -74,14 +79,13 @@ class FieldWindows:
 
     def coordinates(self, window: Sensor, like: Tensor) -> Tensor:
         """(2, H, W): x and y of a window's pixels over half the whole sensor's diagonal."""
-        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
         options = {"dtype": torch.float64, "device": like.device}
         row, column = torch.meshgrid(
             torch.arange(window.height, **options),
             torch.arange(window.width, **options),
             indexing="ij",
         )
-        return torch.stack(window.positions(row, column)).to(like) / half
+        return torch.stack(window.positions(row, column)).to(like) / self.half_diagonal
 
     def _about(self, down: float, across: float) -> Sensor:
         """The window about a point, pixels from the middle, or the nearest that fits."""

@@ -11,6 +11,7 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from dolens.experiments.camera.views.centroids import reference_centroid_map
+from dolens.experiments.camera.views.field_functions import field_functions, field_imaging
 from dolens.experiments.camera.views.field_windows import FieldWindows
 from dolens.experiments.camera.views.truth import (
     CENTROIDS,
@@ -21,6 +22,7 @@ from dolens.experiments.camera.views.truth import (
     sample_texture,
 )
 from dolens.experiments.camera.views.whole import (
+    ByPlace,
     Placing,
     WholePicture,
     at_depth,
@@ -38,6 +40,8 @@ from dolens.rendering.protocol import (
 )
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
+from dolens.rendering.relative_illumination import IlluminationMap
+from dolens.rendering.whole_field import window_side
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.scene.texture import resized
 from dolens.seeded_generators import generator_of
@@ -217,6 +221,11 @@ class FieldViews(Imaging):
         object_points = of_windows(lens, values, self.scene, self.whole, windows)
         return object_points, [nearest_texel(rows, columns) for rows, columns in object_points]
 
+    @property
+    def psf_size(self) -> int:
+        """Pixels along each side of point spread functions."""
+        return self._training.psf_size or _PSF_SIZE
+
     def point_spread_functions(
         self,
         lens: Lens,
@@ -230,12 +239,53 @@ class FieldViews(Imaging):
         found = []
         for share in self.zones.values():
             window = self.windows.zone(share, 0)
-            side = size or self._training.psf_size or _PSF_SIZE
+            side = size or self.psf_size
             renderer = PsfRenderer(window, (1, 1), pupil_samples or 32, side, jitter=False)
             imaging = ImagingSystem.of(lens.system(values), scene, window)
             functions = renderer.point_spread_functions(imaging, 0)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
+
+    def functions_of_images(
+        self, lens: Lens, values: Mapping[str, Tensor], taken: Views, stage: str
+    ) -> Tensor:
+        """Return the functions of the windows' middles; see `Imaging.functions_of_images`."""
+        assert taken.field is not None  # of these views
+        middles = taken.field.double().mean((-2, -1)).flatten(0, 1) * self.windows.half_diagonal
+        renderer = self._training if stage == "train" else self.evaluation_renderer
+        found = field_functions(
+            lens,
+            values,
+            self.scene,
+            self.whole,
+            (middles[:, 0], middles[:, 1]),
+            self.truth,
+            self.psf_size,
+            diffraction_of(renderer),
+        )
+        return found.functions * found.light[:, None, :, None, None]
+
+    def by_place(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        size: tuple[int, int],
+        placing: Placing | None = None,
+    ) -> ByPlace:
+        """Return functions and illumination about the middle of the sensor; see `Imaging`."""
+        sensor = Sensor(*size, self.whole.pixel_pitch)
+        scene = self.scene if placing is None else at_depth(self.scene, placing.depth, lens)
+        diffraction = placing.diffraction if placing else None
+        diffraction = diffraction or diffraction_of(self.evaluation_renderer)
+
+        @torch.no_grad()
+        def functions(rows: Tensor, columns: Tensor) -> Tensor:
+            x, y = (p.to(lens.device) for p in sensor.positions(rows.double(), columns.double()))
+            settings = (self.truth, self.psf_size, diffraction)
+            return field_functions(lens, values, scene, self.whole, (x, y), *settings).functions
+
+        illumination = IlluminationMap.of(field_imaging(lens, values, scene, self.whole).on(sensor))
+        return ByPlace(functions, illumination, window_side(functions, sensor, self.psf_size))
 
     @torch.no_grad()
     def whole_picture(
@@ -291,8 +341,7 @@ class FieldViews(Imaging):
         if diffraction not in (None, diffraction_of(renderer)) and not isinstance(
             renderer, PsfRenderer
         ):
-            size = self._training.psf_size or _PSF_SIZE
-            renderer = PsfRenderer(sensor, (2, 2), size=size, jitter=False)
+            renderer = PsfRenderer(sensor, (2, 2), size=self.psf_size, jitter=False)
         if isinstance(renderer, PsfRenderer):
             # As many functions for a stretch of the sensor as a window has, but no fewer than two.
             fields = [
@@ -312,7 +361,7 @@ class FieldViews(Imaging):
         """Return the spots of the zones."""
         depth = self.scene.depths[0]
         (magnification,) = self.scene.magnifications(lens.system())
-        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        half = self.windows.half_diagonal
         fields = [(0.0, share * half / magnification) for share in sorted(set(self.zones.values()))]
         wavelengths = self.scene.wavelengths
         return [gaussian_quadrature(lens, fields, wavelengths, rings, arms, depth, symmetry=False)]
@@ -320,7 +369,7 @@ class FieldViews(Imaging):
     def spot_weights(self, fields: int) -> list[float]:
         """Return the share of training windows that are nearest to each of the zones' radii."""
         shares = sorted(set(self.zones.values()))
-        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        half = self.windows.half_diagonal
         generator, counts = generator_of(0), [0] * len(shares)
         for _ in range(_DRAWN):
             window = self.windows.training(generator)

@@ -43,14 +43,21 @@ def reference_chief_ray_map(
         Of each window rows and columns from the axis in the image of a pinhole, each
         (D, height, width), in double precision.
     """
+    object_points = chief_ray_maps(reference_imaging(lens, values, scene, whole), windows)
+    return [(rows[:, 0], columns[:, 0]) for rows, columns in object_points]
+
+
+def reference_imaging(
+    lens: Lens, values: Mapping[str, Tensor], scene: Scene, whole: Sensor
+) -> ImagingSystem:
+    """Return the lens at its reference wavelength, with a pupil that is enough for chief rays."""
     system = lens.system(values)
     wavelengths = (lens.primary_wavelength,)
     planes = as_planes(scene, wavelengths=wavelengths)
     pupil = differentiable_chief_pupil(
         system, wavelengths, paraxial_exit_pupil(system, wavelengths)
     )
-    object_points = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
-    return [(rows[:, 0], columns[:, 0]) for rows, columns in object_points]
+    return ImagingSystem(system, planes, whole, pupil)
 
 
 def sample_texture(

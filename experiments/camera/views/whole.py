@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
+from dolens.reconstruction.whole_pictures import Functions, Illumination
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patch_convolution import transform_length
@@ -40,6 +41,20 @@ class WholePicture(NamedTuple):
     image: Tensor
     field: Tensor | None
     mapping: str
+
+
+class ByPlace(NamedTuple):
+    """What restores a whole picture by place; see `restore_whole_picture`.
+
+    Attributes:
+        functions: at rows and columns (N,), pixels: (N, D, 3, K, K), of unit sum.
+        illumination: at rows (H,) and columns (W,): (3, H, W).
+        window: pixels along each side of a window that a function of its middle serves.
+    """
+
+    functions: Functions
+    illumination: Illumination
+    window: int
 
 
 @dataclass(frozen=True)
