@@ -28,10 +28,9 @@ _DEPTHS = (
 )
 # Windows of a large sensor, behind a network that knows where they lie.
 _FIELDS = (
-    "network=unet",
-    "network.field_coordinates=true",
+    "network=field_unet",
+    "loss.perceptual=none",
     "data.batch_size=8",
-    *_SMALL,
 )
 _FORM = ("~data.train", "~data.validation", *_FIELDS)
 
@@ -102,8 +101,6 @@ CASES: Mapping[str, Case] = {
     "doublet of Table III, field": Case(
         (
             "experiment=large_fov_doublet",
-            "~network.stages",
-            "~network.pyramid_channels",
             "renderer=psf_window",
             "renderer.fields=[1,1]",
             "renderer.sensor={height: 64, width: 64}",

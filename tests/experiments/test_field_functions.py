@@ -44,8 +44,6 @@ COARSE = (
 GENERAL = (
     *(o for o in COARSE if not o.startswith("network.")),
     "network=general",
-    "network.held=true",
-    *(f"~network.{key}" for key in ("field_coordinates", "stages", "pyramid_channels")),
 )
 
 
