@@ -15,7 +15,8 @@ residual deviations in the ten flattest squares of 16 pixels, sRGB over 255.
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -78,24 +79,33 @@ JUDGES = {
     "double Gauss, out of focus": Judge("double_gauss", (0.0, 0.0), 15.0, 0.15),
     "free of blur": Judge("cooke_triplet", (0.0, 0.0), 40.0),
 }
-# As the default experiment learned it once, for depths that restorers are not told: all or none.
-PLATE = {
-    "sensor_distance": 95.8045,
-    "surfaces.5.x3": 8.788e-6,
-    "surfaces.5.x2y": 5.430e-6,
-    "surfaces.5.xy2": 3.936e-6,
-    "surfaces.5.y3": 8.345e-6,
+# The doublet with a phase plate, as the default experiment learned it once, and without one; for
+# depths of which restorers are told all, not which it is.
+DOUBLETS = {
+    "phase plate": {
+        "sensor_distance": 95.8045,
+        "surfaces.5.x3": 8.788e-6,
+        "surfaces.5.x2y": 5.430e-6,
+        "surfaces.5.xy2": 3.936e-6,
+        "surfaces.5.y3": 8.345e-6,
+    },
+    "plain doublet": {"sensor_distance": 95.86},
 }
-PLATE_PITCH, PLATE_DEPTHS = 6.9, (8000.0, 6000.0, 4500.0)
-PLATE_COLOURS = (656.2725, 587.5618, 486.1327)
-PLATES = {f"phase plate, {depth / 1e3:g} m": n for n, depth in enumerate(PLATE_DEPTHS)}
+PITCH, DEPTHS, LINES = 6.9, (8000.0, 6000.0, 4500.0), (656.2725, 587.5618, 486.1327)
+AT_DEPTHS = {
+    f"{kind}, {depth / 1e3:g} m": (kind, number)
+    for kind in DOUBLETS
+    for number, depth in enumerate(DEPTHS)
+}
 WRONG = ("focus", "tolerances")
 # Sides of the squares that --flat looks at, and how many.
 FLAT_SIDE, FLAT_COUNT = 16, 10
-RESTORERS = {
+RESTORERS: dict[str, Callable[[], Restoration]] = {
     "tv": WienerTVRestoration,
     "bm3d": WienerBM3DRestoration,
     "general": GeneralRestoration,
+    "by_depth": partial(GeneralRestoration, by_depth=True),
+    "known": GeneralRestoration,  # is told the one function of the image's own depth
 }
 COLOURS = (620.0, 630.0, 535.0, 545.0, 455.0, 465.0)  # nm, two for each of red, green and blue
 
@@ -105,25 +115,25 @@ def functions_of(name: str, wrong: str | None = None) -> Tensor:
     """Return the point spread functions (D, 3, 65, 65) of a lens, or of a wrong one instead.
 
     Args:
-        name: of `JUDGES`, with D = 1, or of `PLATES`, with D = 3 depths.
+        name: of `JUDGES`, with D = 1, or of `AT_DEPTHS`, with D = 3.
         wrong: one of `WRONG`; see above.
 
     Raises:
         InputError: the lens has no smooth wavefront there.
     """
-    plate = name in PLATES
-    lens = load_lens("wavefront_coding" if plate else JUDGES[name].lens, dtype=torch.float64)
-    pitch = 1e-3 * (PLATE_PITCH if plate else JUDGES[name].pitch)
-    if plate:
+    at_depths = name in AT_DEPTHS
+    lens = load_lens("wavefront_coding" if at_depths else JUDGES[name].lens, dtype=torch.float64)
+    pitch = 1e-3 * (PITCH if at_depths else JUDGES[name].pitch)
+    if at_depths:
         parameters = dict(lens.named_parameters())
-        for key, value in PLATE.items():
+        for key, value in DOUBLETS[AT_DEPTHS[name][0]].items():
             parameters[key].fill_(value)
     if wrong == "tolerances":
         lens = within_tolerances(lens, Draw(torch.Generator().manual_seed(0)), 1.0)
     defocus = pitch * float(lens.first_order().f_number) if wrong == "focus" else 0.0
-    if plate:
+    if at_depths:
         lens.sensor_distance.add_(defocus)
-        scene, sensor = PlanarScene(PLATE_DEPTHS, PLATE_COLOURS), Sensor(SIDE, SIDE, pitch)
+        scene, sensor = PlanarScene(DEPTHS, LINES), Sensor(SIDE, SIDE, pitch)
         found = axial_point_spread_functions(lens, scene, sensor, 65, 48, centred=True)
         return (found / found.sum((-2, -1), keepdim=True)).float()
     judge = JUDGES[name]
@@ -171,7 +181,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--package-folders", nargs="*", type=Path, default=data_folders())
     parser.add_argument("--light", nargs="+", type=float, default=[100.0], help="electrons")
-    names = [*PLATES, *JUDGES]
+    names = [*AT_DEPTHS, *JUDGES]
     parser.add_argument("--lenses", nargs="+", default=names, choices=names)
     parser.add_argument("--restorers", nargs="+", default=["tv", "general"], choices=RESTORERS)
     parser.add_argument("--wrong", nargs="*", default=[], choices=WRONG)
@@ -216,12 +226,14 @@ def pictures(
     readout = Readout.at_light(light, max(light, 8180.0), read_noise=3.0 / max(light, 8180.0))
     noise = torch.tensor(readout.noise)
     inner = (..., slice(MARGIN, MARGIN + SIDE), slice(MARGIN, MARGIN + SIDE))
-    image = blurred(scenes, made[PLATES.get(name, 0)])[inner].clamp(min=0.0)
+    imaged = AT_DEPTHS[name][1] if name in AT_DEPTHS else 0
+    image = blurred(scenes, made[imaged])[inner].clamp(min=0.0)
     raw = readout.develop(readout(image, torch.Generator().manual_seed(0)))
     restored, seconds = {}, {}
     for label, network in restorers.items():
         begun = time.process_time()
-        found = torch.cat([network(one[None], told, None, noise) for one in raw])
+        own = told[imaged : imaged + 1] if label == "known" else told
+        found = torch.cat([network(one[None], own, None, noise) for one in raw])
         seconds[label] = (time.process_time() - begun) / len(raw)
         restored[label] = found.clamp(0.0, 1.0)
     return Pictures(linear_to_srgb(scenes[inner]), restored, seconds)
