@@ -65,7 +65,9 @@ def test_at_other_depths_the_network_has_the_functions_of_its_own(trained):
     assert {"test/psnr_db/5m"} == {n for n in found.metrics if n.startswith("test/psnr_db/5")}
     with torch.no_grad():
         camera, before = found.run.module, load_run(trained).module
-        functions, own = (c.functions(c.variables()) for c in (camera, before))
+        functions, own = (
+            c.functions(c.variables(), taken=None, stage="test") for c in (camera, before)
+        )
     assert torch.equal(functions, own) and len(own) == 3
 
 

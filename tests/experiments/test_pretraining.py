@@ -182,7 +182,10 @@ def test_a_resumed_training_is_the_same_to_the_bit(composed, tmp_path):
     ("expected", "overrides"),
     [
         ("network: FeaturePyramidRestoration; allowed for", ["network=feature_pyramid"]),
-        ("variables: allowed for pretraining: null", ["variables={sensor_distance: {scale: 0.2}}"]),
+        (
+            "variables: allowed for pretraining: null",
+            ["variables={sensor_distance: {scale: 0.2}}", "network.held=false"],
+        ),
         ("data.lenses", ["data.lenses=0"]),
         ("network.weights", ["network.weights=nowhere.pt"]),
     ],
