@@ -149,14 +149,19 @@ def given_to_the_network(raw: Tensor, light: Tensor, functions: Tensor, noise: T
     shot = shot.clamp(min=LEAST_SHOT)
     pedestal = read / shot + 0.375 * shot
     # Not len(raw), by which torch.export would fix the number of images.
-    stabiliser = Stabiliser(pedestal.expand(raw.shape[0]))
-    images = stabiliser.forward(torch.cat([raw[:, None], light], dim=1)).flatten(1, 2)
+    pedestals = pedestal.expand(raw.shape[0])
+    images = stabilised_images(raw, light, pedestals)
     # Of one unit of light y's noise has this deviation where shot noise rules.
     deviation = 0.5 * shot.sqrt() * ((1.0 + pedestal).sqrt() + pedestal.sqrt())
     several = raw.new_tensor(float(len(functions) > 1))
     known = torch.stack([deviation.log10(), pedestal.log10(), several])
     known = torch.cat([known, _known_in_bands(functions.to(raw), ratios, deviation)])
-    return Prepared(images, known.expand(raw.shape[0], -1), stabiliser.pedestal)
+    return Prepared(images, known.expand(raw.shape[0], -1), pedestals)
+
+
+def stabilised_images(raw: Tensor, light: Tensor, pedestals: Tensor) -> Tensor:
+    """Return the images of a `Prepared`, of the sensor's and the filters' in linear light."""
+    return Stabiliser(pedestals).forward(torch.cat([raw[:, None], light], dim=1)).flatten(1, 2)
 
 
 def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Tensor:

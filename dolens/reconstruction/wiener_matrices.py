@@ -18,9 +18,9 @@ from dolens.reconstruction.feature_wiener import DeconvolvedRestoration
 from dolens.reconstruction.general import (
     GeneralRestoration,
     Prepared,
-    Stabiliser,
     given_to_the_network,
     noise_to_signal,
+    stabilised_images,
 )
 from dolens.reconstruction.opponent_wiener import colour_filters, correlations
 from dolens.reconstruction.restoration import COLORS, WienerUNetRestoration
@@ -278,9 +278,9 @@ class FixedGeneral(nn.Module):
         """Restore (B, 3, height, width) linear light to sRGB."""
         light = self.filters(raw).unflatten(1, (-1, COLORS))
         pedestal = self.pedestal.expand(raw.shape[0])
-        images = Stabiliser(pedestal).forward(torch.cat([raw[:, None], light], dim=1))
+        images = stabilised_images(raw, light, pedestal)
         known = self.known.expand(raw.shape[0], -1)
-        return self.network.restored(Prepared(images.flatten(1, 2), known, pedestal))
+        return self.network.restored(Prepared(images, known, pedestal))
 
 
 def _matrices(length: int, frequencies: int) -> tuple[Tensor, Tensor]:

@@ -140,7 +140,7 @@ class LensCamera:
             "restored": restore_whole_picture(self.restorer, *places).clamp_(0.0, 1.0),
         }
         depths = field.imaging.scene.depths
-        if len(depths) > 1:
+        if len(set(depths)) > 1:
 
             def look(raw: Tensor, functions: Tensor, _: None, noise: Tensor) -> Tensor:
                 return depth_picture(depth_probabilities(raw, functions, noise), depths)

@@ -5,13 +5,10 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from dolens.experiments.camera.views.truth import reference_chief_ray_map
+from dolens.experiments.camera.views.truth import light_imaging, reference_chief_ray_map
 from dolens.optics.lens import Lens
-from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points, plane_points
 from dolens.rendering.psf_grid import sampled_disc
-from dolens.rendering.pupil.differentiable_pupil import differentiable_exit_pupil
-from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
 from dolens.scene.planar import as_planes
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
@@ -61,11 +58,8 @@ def centroid_moves(
         Rows and columns in the image of a pinhole, each (N, D), in double precision.
     """
     system = lens.system(values)
-    wavelengths = (lens.primary_wavelength,)
-    planes = as_planes(scene, wavelengths=wavelengths)
-    pupil = sampled_exit_pupil(system, wavelengths, whole)
-    pupil = differentiable_exit_pupil(system, wavelengths, pupil)
-    imaging = ImagingSystem(system, planes, whole, pupil)
+    planes = as_planes(scene, wavelengths=(lens.primary_wavelength,))
+    imaging = light_imaging(system, planes, whole)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _SAMPLES, None, system)
     seen = plane_points(imaging, points, disc)
     weight = seen.weight.expand(seen.rows.shape)

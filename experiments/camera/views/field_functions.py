@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from dolens.experiments.camera.views.centroids import centroid_moves
-from dolens.experiments.camera.views.truth import CENTROIDS, reference_imaging
+from dolens.experiments.camera.views.truth import CENTROIDS, light_imaging, reference_imaging
 from dolens.optics.backend import say_once, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.imaging_system import ImagingSystem
@@ -16,7 +16,6 @@ from dolens.rendering.place_functions import (
     pinhole_places,
     place_functions,
 )
-from dolens.rendering.pupil.differentiable_pupil import differentiable_exit_pupil
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
@@ -28,10 +27,7 @@ def field_imaging(
     lens: Lens, values: Mapping[str, Tensor], scene: Scene, whole: Sensor
 ) -> ImagingSystem:
     """Return the lens in front of the whole sensor, with a pupil that follows its values."""
-    system = with_chosen_backend(lens.system(values))
-    imaging = ImagingSystem.of(system, scene, whole)
-    pupil = differentiable_exit_pupil(system, scene.wavelengths, imaging.pupil)
-    return ImagingSystem(system, scene, whole, pupil)
+    return light_imaging(with_chosen_backend(lens.system(values)), scene, whole)
 
 
 def ideal_places(

@@ -7,9 +7,13 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.system import OpticalSystem
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.differentiable_pupil import differentiable_chief_pupil
+from dolens.rendering.pupil.differentiable_pupil import (
+    differentiable_chief_pupil,
+    differentiable_exit_pupil,
+)
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.scene.planar import as_planes
 from dolens.scene.scene import Scene
@@ -58,6 +62,13 @@ def reference_imaging(
         system, wavelengths, paraxial_exit_pupil(system, wavelengths)
     )
     return ImagingSystem(system, planes, whole, pupil)
+
+
+def light_imaging(system: OpticalSystem, scene: Scene, whole: Sensor) -> ImagingSystem:
+    """Return a lens in front of the whole sensor, with the pupil of its light, which follows it."""
+    imaging = ImagingSystem.of(system, scene, whole)
+    pupil = differentiable_exit_pupil(system, scene.wavelengths, imaging.pupil)
+    return ImagingSystem(system, scene, whole, pupil)
 
 
 def sample_texture(
