@@ -6,6 +6,10 @@ Gaussian log-likelihood of a neighbourhood is -½ (mean e² + mean log(S·|H_d|�
 values, e being the filtered image (Levin et al., ACM Trans. Graph. 26, 70, 2007; Zhu et al., IEEE
 Trans. Image Process. 22, 4879, 2013).  Contrast and softness of what is there are unknown: S is the
 best of several.
+
+Several readouts, each over its noise's deviation, have the covariance 1 + S·g·gᴴ, g_n being H_dn
+over that of readout n.  Its root's inverse leaves what is orthogonal to g, and divides what lies
+along it by √(1 + S·|g|²), which is its determinant's root.
 """
 
 import math
@@ -41,19 +45,21 @@ def depth_probabilities(raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor
     It judges by the mean of the colours, and no gradient passes.
 
     Args:
-        raw: linear light, (B, 3, H, W).
-        functions: point spread functions of D depths, (D, 3, K, K), K odd.
-        noise: variance at light x is noise[0]·x + noise[1], (2,).
+        raw: linear light, (B, 3, H, W), or of N readouts (B, N, 3, H, W).
+        functions: point spread functions of D depths, (D, 3, K, K), K odd, or (N, D, 3, K, K).
+        noise: variance at light x is noise[0]·x + noise[1], (2,), or (N, 2).
 
     Returns:
         (B, D, H, W), of sum 1 over D.
     """
     height, width = raw.shape[-2:]
     functions, noise = functions.to(raw), noise.to(raw)
-    light = raw.mean(dim=1)
+    if raw.ndim == 4:
+        raw, functions, noise = raw[:, None], functions[None], noise[None]
+    light = raw.mean(dim=2)
     reach = math.ceil(3.0 * _REACH)
     rows, columns = padded_lengths(height, width, reach, functions.shape[-1])
-    power = transfer_function(functions.mean(dim=1), rows, columns).abs().square()
+    transfer = transfer_function(functions.mean(dim=2), rows, columns).transpose(0, 1)
     spectrum = torch.fft.rfft2(close_periodically(light, rows, columns))
     square = squared_frequency(rows, columns, raw)
     square[0, 0] = square[0, 1]
@@ -62,22 +68,28 @@ def depth_probabilities(raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor
     share[:, 0] = share[:, 0] / 2.0
     if columns % 2 == 0:
         share[:, -1] = share[:, -1] / 2.0
-    variance = (noise[0] * light.mean(dim=(-2, -1)).clamp(min=0.0) + noise[1]) / 3.0
-    variance = variance.clamp(min=1e-9)[:, None, None]
+    variance = noise[:, 0] * light.mean(dim=(-2, -1)).clamp(min=0.0) + noise[:, 1]
+    deviation = (variance / 3.0).clamp(min=1e-9).sqrt()[..., None, None]  # (B, N, 1, 1)
+    spectrum = spectrum / deviation
 
     def likelihood(depth: int) -> Tensor:
+        along = transfer[depth] / deviation
+        power = along.abs().square().sum(dim=1, keepdim=True)
+        seen = (along.conj() * spectrum).sum(dim=1, keepdim=True)
+        seen = along * (seen / power.clamp(min=torch.finfo(power.dtype).tiny))
+        beside = spectrum - seen
         found = []
         for contrast, slope in product(_CONTRASTS, _SLOPES):
             signal = contrast * REFERENCE_VARIANCE / 3.0 * square ** (-1.0 - slope / 2.0)
-            density = signal * power[depth] + variance
-            filtered = spectrum * density.rsqrt()
+            density = 1.0 + signal * power
+            filtered = beside + seen * density.rsqrt()
             filtered[..., 0, 0] = 0.0  # the mean tells nothing of the blur
             white = torch.fft.irfft2(filtered, s=(rows, columns))[..., :height, :width]
-            level = (density.log() * share).sum(dim=(-2, -1))
-            found.append(-0.5 * (_near(white.square()) + level[:, None, None]))
+            level = (density.log() * share).sum(dim=(-2, -1))  # (B, 1)
+            found.append(-0.5 * (_near(white.square().sum(dim=1)) + level[:, None]))
         return torch.stack(found).amax(dim=0)
 
-    values = torch.stack([likelihood(depth) for depth in range(len(functions))], dim=1)
+    values = torch.stack([likelihood(depth) for depth in range(len(transfer))], dim=1)
     # A Gaussian neighbourhood weighs as many values as 4πσ² alike.
     return (values * (_INDEPENDENT * 4.0 * math.pi * _REACH**2)).softmax(dim=1)
 

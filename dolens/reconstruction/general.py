@@ -20,15 +20,15 @@ from dolens.reconstruction.depth_choice import depth_probabilities, picture_weig
 from dolens.reconstruction.nafnet import NAFNet
 from dolens.reconstruction.opponent_wiener import (
     OPPONENT,
-    check_functions,
     colour_filters,
     correlations,
     functions_of_each,
     over_depths,
     solve_in_opponent_colours,
 )
+from dolens.reconstruction.readouts import LEAST_SHOT, MEAN_LIGHT, readouts_of
 from dolens.reconstruction.restoration import COLORS, Restoration
-from dolens.reconstruction.untrained import LEAST_SHOT, REFERENCE_VARIANCE
+from dolens.reconstruction.untrained import REFERENCE_VARIANCE
 from dolens.reconstruction.wiener import (
     close_periodically,
     padded_lengths,
@@ -40,8 +40,6 @@ from dolens.sensor.colour import linear_to_srgb
 # Noise over signal power, as those of `UntrainedRestoration`, of the three filters.
 _RATIOS = ((0.1, 0.7, 2.0), (0.4, 2.8, 8.0), (1.6, 11.2, 32.0))
 _MIDDLE = 1
-# The light that the filters take for that of all pixels: the mean of photographs.
-_MEAN_LIGHT = 0.2
 # Frequencies, over Nyquist's, between which transfer and noise are averaged for the network.
 _BANDS = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 # Pixels of the grid that they are taken on, whatever the size of the image.
@@ -103,46 +101,47 @@ class Prepared(NamedTuple):
 def prepared(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     """Return what the network is given of images of one camera.
 
+    Of several readouts it is given the filters of least squares over all of them, and their mean.
+
     Beside the images it is told the logarithms of the noise's deviation and of the pedestal, the
     number of functions, and in bands of frequency for each filter W the luminance's mean transfer
     Re⟨W·H⟩ and the noise's density, and the deviation of the middle one's transfer over depths.
 
     Args:
-        raw: linear light, (B, 3, H, W).
-        functions: point spread functions of D depths, (D, 3, K, K), K odd.
-        noise: variance at light x is noise[0]·x + noise[1], (2,).
+        raw: linear light, (B, 3, H, W), or of N readouts (B, N, 3, H, W).
+        functions: point spread functions of D depths, (D, 3, K, K), K odd, or (N, D, 3, K, K).
+        noise: variance at light x is noise[0]·x + noise[1], (2,), or (N, 2).
 
     Raises:
-        InputError: functions of another shape.
+        InputError: functions of another shape, or of another number of readouts.
     """
-    check_functions(functions)
-    functions = functions.to(raw)
+    functions_of_each(raw[:1], functions)
+    readouts = readouts_of(raw, functions, noise)
     height, width = raw.shape[-2:]
     rows, columns = padded_lengths(height, width, functions.shape[-1] // 2, functions.shape[-1])
-    matched, power = correlations(functions, rows, columns)
-    spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
-    ratios = noise_to_signal(noise.to(raw))
+    matched, power = correlations(readouts.functions, rows, columns)
+    spectrum = torch.fft.rfft2(close_periodically(readouts.images, rows, columns))
     solved = solve_in_opponent_colours(
-        power,
+        power.sum(dim=0),
         squared_frequency(rows, columns, raw),
-        ratios,
-        (matched * spectrum)[:, None],
+        noise_to_signal(readouts.noise),
+        (matched * spectrum).sum(dim=1)[:, None],
     )
     light = torch.fft.irfft2(solved, s=(rows, columns))[..., :height, :width]
-    return given_to_the_network(raw, light, functions, noise)
+    return given_to_the_network(readouts.mean, light, readouts.functions, readouts.noise)
 
 
 def noise_to_signal(noise: Tensor) -> Tensor:
     """Return the ratios of the three filters in opponent colours, (3, 3), at a noise (2,)."""
     shot, read = noise.unbind()
-    variance = _MEAN_LIGHT * shot.clamp(min=LEAST_SHOT) + read
+    variance = MEAN_LIGHT * shot.clamp(min=LEAST_SHOT) + read
     return noise.new_tensor(_RATIOS) * variance / REFERENCE_VARIANCE
 
 
 def given_to_the_network(raw: Tensor, light: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     """Return what the network is given where the filters' images (B, 3, 3, H, W) are known.
 
-    The other arguments are those of `prepared`.
+    The others are of `Readouts`: the mean (B, 3, H, W), functions (N, D, 3, K, K) and the noise.
     """
     ratios = noise_to_signal(noise.to(raw))
     shot, read = noise.to(raw).unbind()
@@ -153,7 +152,7 @@ def given_to_the_network(raw: Tensor, light: Tensor, functions: Tensor, noise: T
     images = stabilised_images(raw, light, pedestals)
     # Of one unit of light y's noise has this deviation where shot noise rules.
     deviation = 0.5 * shot.sqrt() * ((1.0 + pedestal).sqrt() + pedestal.sqrt())
-    several = raw.new_tensor(float(len(functions) > 1))
+    several = raw.new_tensor(float(functions.shape[1] > 1))
     known = torch.stack([deviation.log10(), pedestal.log10(), several])
     known = torch.cat([known, _known_in_bands(functions.to(raw), ratios, deviation)])
     return Prepared(images, known.expand(raw.shape[0], -1), pedestals)
@@ -165,20 +164,21 @@ def stabilised_images(raw: Tensor, light: Tensor, pedestals: Tensor) -> Tensor:
 
 
 def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Tensor:
-    """Return means over the bands: transfers of N filters, the middle one's deviation, and
-    logarithms of the noise's densities, (6·(2N + 1),).
+    """Return means over the bands: transfers of M filters, the middle one's deviation, and
+    logarithms of the noise's densities, (6·(2M + 1),).
     """
     side = max(_GRID, functions.shape[-1] + functions.shape[-1] % 2)
     transfer = transfer_function(functions, side, side)
     matched, power = over_depths(transfer)
-    count = len(ratios)
+    power = power.sum(dim=0)
     filters = colour_filters(
-        power.expand(count, *power.shape), matched.expand(count, *matched.shape), ratios, side
+        power.expand(len(ratios), *power.shape), torch.ones_like(matched[:1]), ratios, side
     )
     grey = torch.tensor(OPPONENT[0]).to(functions)
-    rows = torch.einsum("i,nijuv->njuv", grey.to(filters), filters)
-    passed = torch.einsum("njuv,djuv,j->dnuv", rows, transfer, grey.to(rows)).real
-    noise = rows.abs().square().sum(dim=1)
+    # From colour j of readout n to the luminance of filter m.
+    rows = torch.einsum("i,mijuv,njuv->mnjuv", grey.to(filters), filters, matched)
+    passed = torch.einsum("mnjuv,ndjuv,j->dmuv", rows, transfer, grey.to(rows)).real
+    noise = rows.abs().square().sum(dim=(1, 2))
     radius = squared_frequency(side, side, functions).sqrt()
     bands = []
     for low, high in pairwise(_BANDS):
@@ -198,9 +198,9 @@ def _known_in_bands(functions: Tensor, ratios: Tensor, deviation: Tensor) -> Ten
 
 def prepared_with(raw: Tensor, functions: Tensor, noise: Tensor) -> Prepared:
     """Return what the network is given of images with functions (D, 3, K, K) of all of them, or
-    (B, D, 3, K, K), of each its own.
+    (B, D, 3, K, K), of each its own; of readouts as `functions_of_each` has them.
     """
-    if functions.ndim == 4:
+    if functions.ndim == raw.ndim:
         return prepared(raw, functions, noise)
     pairs = zip(raw.split(1), functions_of_each(raw, functions), strict=True)
     parts = [prepared(image, own, noise) for image, own in pairs]
@@ -238,6 +238,7 @@ class GeneralRestoration(Restoration):
     needs_point_spread_function: ClassVar[bool] = True
     needs_noise: ClassVar[bool] = True
     takes_functions_of_images: ClassVar[bool] = True
+    takes_readouts: ClassVar[bool] = True
 
     def __init__(
         self,

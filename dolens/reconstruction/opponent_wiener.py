@@ -189,32 +189,36 @@ def check_functions(functions: Tensor, depths: int | None = None) -> None:
 
 
 def functions_of_each(images: Tensor, functions: Tensor) -> Sequence[Tensor]:
-    """Return the point spread functions (D, 3, K, K) of each of B images.
+    """Return the point spread functions (D, 3, K, K) of each of B images, or (N, D, 3, K, K) of
+    each readout of each.
 
     Args:
-        images: (B, ...).
-        functions: (D, 3, K, K) of all images, or (B, D, 3, K, K).
+        images: (B, 3, H, W), or of N readouts (B, N, 3, H, W).
+        functions: (D, 3, K, K) of all images, or (B, D, 3, K, K); of readouts (N, D, 3, K, K), or
+            (B, N, D, 3, K, K).
 
     Raises:
         InputError: functions of another shape.
     """
-    if functions.ndim == 4:
+    if functions.ndim == images.ndim:
         functions = functions.expand(len(images), *functions.shape)
-    if functions.ndim != 5 or len(functions) != len(images):
+    if functions.ndim != images.ndim + 1 or len(functions) != len(images):
+        several = "readouts, " if images.ndim == 5 else ""
         raise InputError(
             f"point_spread_functions of shape {tuple(functions.shape)}: expected "
-            f"(depths, 3, K, K), or ({len(images)}, depths, 3, K, K), of each image"
+            f"({several}depths, 3, K, K), or ({len(images)}, {several}depths, 3, K, K), of each "
+            "image"
         )
-    for own in functions:
+    for own in functions.flatten(0, -5):
         check_functions(own)
     return functions.unbind()
 
 
 def correlations(functions: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-    """Return mean H* and mean |H|² over the depths, each (3, rows, columns // 2 + 1).
+    """Return mean H* and mean |H|² over the depths, each (..., 3, rows, columns // 2 + 1).
 
     Args:
-        functions: point spread functions (D, 3, K, K), K odd; H are their transforms.
+        functions: point spread functions (..., D, 3, K, K), K odd; H are their transforms.
         rows: of the padded image.
         columns: of the padded image.
     """
@@ -222,9 +226,9 @@ def correlations(functions: Tensor, rows: int, columns: int) -> tuple[Tensor, Te
 
 
 def over_depths(transfer: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean H* and mean |H|² of transfer functions (D, ...), each (...)."""
-    power = (transfer.real**2 + transfer.imag**2).mean(dim=0)
-    return transfer.mean(dim=0).conj(), power
+    """Return mean H* and mean |H|² of transfer functions (..., D, 3, R, C), each (..., 3, R, C)."""
+    power = (transfer.real**2 + transfer.imag**2).mean(dim=-4)
+    return transfer.mean(dim=-4).conj(), power
 
 
 def solve_in_opponent_colours(

@@ -29,14 +29,17 @@ class Restoration(nn.Module):
     spread functions and the field coordinates at all; where one is False they are ignored and
     may be None.  Where `needs_noise` is True, `forward` takes the sensor's noise besides, (2,): its
     variance at light x is noise[0]·x + noise[1].  Where `takes_functions_of_images` is True, each
-    image may have functions of its own.  `pretrained` tells whether any of the network began with
-    trained weights, `restores_already` whether all of it did, for restoring pictures.
+    image may have functions of its own; where `takes_readouts` is, an image may be N readouts with
+    functions and noise of each: see `functions_of_each`.  `pretrained` tells whether any of the
+    network began with trained weights, `restores_already` whether all of it did, for restoring
+    pictures.
     """
 
     needs_point_spread_function: ClassVar[bool] = False
     needs_field: bool = False
     needs_noise: ClassVar[bool] = False
     takes_functions_of_images: ClassVar[bool] = False
+    takes_readouts: ClassVar[bool] = False
     pretrained: bool = False
     restores_already: bool = False
 
@@ -65,8 +68,10 @@ class Restoration(nn.Module):
         """
         raise NotImplementedError
 
-    def noise_arguments(self, noise: Sequence[float]) -> list[Tensor]:
-        """Return what `forward` takes after the field: the noise (2,) where it is asked for."""
+    def noise_arguments(self, noise: Sequence[float] | Sequence[Sequence[float]]) -> list[Tensor]:
+        """Return what `forward` takes after the field: the noise (2,), or (N, 2) of readouts, where
+        it is asked for.
+        """
         return [torch.tensor(noise)] if self.needs_noise else []
 
     def functions_and_noise(

@@ -23,6 +23,7 @@ from dolens.reconstruction.opponent_wiener import (
     correlations,
     functions_of_each,
 )
+from dolens.reconstruction.readouts import LEAST_SHOT, readouts_of
 from dolens.reconstruction.restoration import Restoration
 from dolens.reconstruction.variance_stabilising import VarianceStabiliser
 from dolens.reconstruction.wiener import close_periodically, padded_lengths
@@ -33,10 +34,6 @@ Array = NDArray[np.float64]
 # The noise's variance that ratios are stated for: 100 electrons in white and a read noise of 3, at
 # a quarter of white, near the mean of photographs.
 REFERENCE_VARIANCE = 0.25 / 100.0 + (3.0 / 100.0) ** 2
-
-# Of the noise's variance for each unit of light: without noise there is nothing to even out, and a
-# thousandth of the reference's is invisible.
-LEAST_SHOT = 1e-5
 
 
 class UntrainedRestoration(Restoration):
@@ -59,6 +56,7 @@ class UntrainedRestoration(Restoration):
     needs_point_spread_function: ClassVar[bool] = True
     needs_noise: ClassVar[bool] = True
     takes_functions_of_images: ClassVar[bool] = True
+    takes_readouts: ClassVar[bool] = True
 
     def __init__(self, noise_to_signal: Sequence[float]) -> None:
         super().__init__()
@@ -93,22 +91,25 @@ class UntrainedRestoration(Restoration):
         return torch.stack([self._restored(image, own, noise) for image, own in pairs])
 
     def _restored(self, raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor:
-        shot, read = (float(value) for value in noise)
+        readouts = readouts_of(raw[None], functions, noise)
+        shot, read = (float(value) for value in readouts.noise)
         shot = max(shot, LEAST_SHOT)
         height, width = raw.shape[-2:]
-        ratio = (shot * float(raw.mean().clamp(min=0.0)) + read) / REFERENCE_VARIANCE
+        light = float(readouts.mean.mean().clamp(min=0.0))
+        ratio = (shot * light + read) / REFERENCE_VARIANCE
         size = functions.shape[-1]
         rows, columns = padded_lengths(height, width, size // 2, size)
-        matched, power = correlations(functions, rows, columns)
-        filters = colour_filters(power[None], matched[None], ratio * self.ratios[None], columns)[0]
-        spectrum = torch.fft.rfft2(close_periodically(raw, rows, columns))
-        found = torch.einsum("cduv,duv->cuv", filters, spectrum)
-        light = torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
-        power = noise_power(filters, columns)
+        matched, power = correlations(readouts.functions, rows, columns)
+        power = power.sum(dim=0, keepdim=True).expand_as(power)
+        filters = colour_filters(power, matched, ratio * self.ratios[None], columns)
+        spectrum = torch.fft.rfft2(close_periodically(readouts.images[0], rows, columns))
+        found = torch.einsum("ncduv,nduv->cuv", filters, spectrum)
+        image = torch.fft.irfft2(found, s=(rows, columns))[..., :height, :width]
+        power = noise_power(filters.transpose(0, 1).flatten(1, 2), columns)
         stabiliser = VarianceStabiliser.of_filtered(shot, read, power.mean(dim=(-2, -1)))
-        image = stabiliser.stabilised(light).permute(1, 2, 0).double().cpu().numpy()
+        even = stabiliser.stabilised(image).permute(1, 2, 0).double().cpu().numpy()
         colour = resampled_spectrum(power, height, width)
-        clean = torch.from_numpy(np.ascontiguousarray(self.denoised(image, colour))).to(light)
+        clean = torch.from_numpy(np.ascontiguousarray(self.denoised(even, colour))).to(image)
         return linear_to_srgb(stabiliser.undone(clean.permute(2, 0, 1)))
 
 
@@ -116,7 +117,8 @@ def noise_power(filters: Tensor, columns: int) -> Tensor:
     """Return the power of each colour's noise behind filters, of white noise of variance 1.
 
     Args:
-        filters: to a colour from a colour, on the grid of `torch.fft.rfft2`, (3, 3, R, C // 2 + 1).
+        filters: to a colour from a colour, on the grid of `torch.fft.rfft2`, (3, 3, R, C // 2 + 1),
+            or from those of several readouts, (3, 3·N, R, C // 2 + 1).
         columns: C.
 
     Returns:

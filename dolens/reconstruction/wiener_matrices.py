@@ -269,7 +269,7 @@ class FixedGeneral(nn.Module):
         weights = colour_filters(power, matched, noise_to_signal(noise), columns).flatten(0, 1)
         self.filters = FilterMatrices(weights, columns, height, width, dtype)
         nothing = functions.new_zeros(1, COLORS, 1, 1)
-        given = given_to_the_network(nothing, nothing[:, None], functions, noise)
+        given = given_to_the_network(nothing, nothing[:, None], functions[None], noise)
         self.register_buffer("known", given.known.to(dtype))
         self.register_buffer("pedestal", given.pedestal.to(dtype))
         self.network = network

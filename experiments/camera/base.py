@@ -58,9 +58,15 @@ class Camera(Experiment):
         if not view_norm >= 1.0:
             raise InputError(f"view_norm must be at least 1, not {view_norm}")
         self.view_norm = view_norm
+        if views.readouts and not self.network.takes_readouts:
+            raise InputError(
+                f"exposures: {type(self.network).__name__} takes one readout; allowed: "
+                "network=general, wiener_tv, wiener_bm3d, or exposures.readouts=one"
+            )
         size = (views.sensor.height, views.sensor.width)
-        functions = (1, 1) if self.knows_places else (len(views.psf_labels()),)
-        check_reconstruction(self.network, self.loss, size, functions)
+        functions = 1 if self.knows_places else len(views.psf_labels()) // (views.readouts or 1)
+        images = 1 if self.knows_places else None
+        check_reconstruction(self.network, self.loss, size, functions, images, views.readouts)
 
     @property
     def knows_places(self) -> bool:
@@ -75,14 +81,16 @@ class Camera(Experiment):
             functions: point spread functions, or None where the network asks for none.
         """
         field = None if taken.field is None else taken.field.flatten(0, 1)
-        restored = self.network(taken.raw.flatten(0, 1), functions, field, *self.noise())
+        restored = self.network(taken.given, functions, field, *self.noise())
         # Under autocast a network may end in half precision, in which nothing is to be compared.
         restored = restored.to(self.network.dtype)
         return restored.unflatten(0, taken.raw.shape[:2])
 
     def noise(self) -> list[Tensor]:
-        """Return the noise of the sensor, (2,), in a list; none where the network asks for none."""
-        return self.network.noise_arguments(self.views.readout.noise)
+        """Return the noise of the sensor, (2,) or (N, 2) of readouts, in a list; none where the
+        network asks for none.
+        """
+        return self.network.noise_arguments(self.views.noise)
 
     def filtered(self, taken: Views, functions: Tensor | None) -> Tensor | None:
         """Return pictures (B, V, 3, H, W) by the network's linear filter alone, display-encoded.
@@ -168,7 +176,7 @@ class Camera(Experiment):
         if not self.network.needs_point_spread_function:
             return None
         own = None
-        if self.knows_places:
+        if self.network.takes_functions_of_images:
             own = self.views.functions_of_images(self.lens, values, taken, stage)
         return self.views.point_spread_functions(self.lens, values) if own is None else own
 

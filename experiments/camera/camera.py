@@ -42,6 +42,7 @@ from dolens.experiments.camera.training_parts import (
     summary_numbers,
 )
 from dolens.experiments.camera.views.base import Imaging
+from dolens.experiments.camera.views.exposures import Exposures
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import UntrainedRestoration, psnr_db
@@ -97,6 +98,7 @@ class CameraModule(Camera):
             `Evaluation`.
         tolerances: of the lens that is made, see `tolerances_from`; None: the lens as drawn.
         as_built: how lenses are made, and what is known of them.
+        exposures: how the states of a lens share the exposure time; None: one exposure.
 
     Raises:
         InputError: a setting is out of range, or the network or the loss does not fit.
@@ -114,7 +116,12 @@ class CameraModule(Camera):
         miscalibrations: Mapping[str, Miscalibration] | None,
         tolerances: Mapping[str, Any] | None = None,
         as_built: AsBuilt | None = None,
+        exposures: Exposures | None = None,
     ) -> None:
+        if exposures is not None:
+            views = exposures.of(views, lens)
+            if tolerances is not None:
+                raise InputError("exposures: given; allowed with tolerances: null")
         super().__init__(
             lens,
             experiment,
@@ -236,7 +243,7 @@ class CameraModule(Camera):
         with self.costs.making_images():
             values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
             taken, functions = training_images(self, self.manufacture, values, batch, share)
-        self.costs.watch_backward(taken.raw)
+        self.costs.watch_backward(taken.given)
         restored = restored_in_parts(self, taken, functions)
         truth = taken.truth.to(restored.dtype)
         terms = self.loss_over_views(restored, truth, shared=True)

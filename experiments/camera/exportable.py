@@ -169,6 +169,8 @@ def exportable(
         raise InputError(f"image size {size}: allowed: {_MOST_PIXELS:.3g} pixels at most")
     if multiple is not None and multiple > _MOST:
         raise InputError(f"multiple of {multiple}: allowed: {_MOST} at most")
+    if camera.views.readouts:
+        raise InputError("exposures.readouts: each; allowed in an exported network: one")
     if isinstance(camera.network, UntrainedRestoration) or camera.knows_places:
         raise InputError(
             f"network: {type(camera.network).__name__} is no network of tensors alone, or is "

@@ -20,6 +20,7 @@ from dolens.plotting.layout import layout_title, lens_title, optics_text, shown_
 from dolens.plotting.number_text import number_text
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities
+from dolens.reconstruction.opponent_wiener import functions_of_each
 from dolens.sensor.colour import linear_to_srgb
 
 _PUPIL_SAMPLES = 96  # along each side of the pupil
@@ -84,7 +85,9 @@ def _depths(camera: Camera, taken: Views, functions: Tensor | None) -> dict[str,
     chooses = getattr(camera.network, "by_depth", False) and len(depths) > 1
     if not chooses or functions is None:
         return {}
-    found = depth_probabilities(taken.raw[0], functions, *camera.noise())
+    images = taken.given[: taken.raw.shape[1]]
+    pairs = zip(images.split(1), functions_of_each(images, functions), strict=True)
+    found = torch.cat([depth_probabilities(*pair, *camera.noise()) for pair in pairs])
     name = f"depth, black {_metres(max(depths))}, white {_metres(min(depths))}"
     return {name: depth_picture(found, depths).cpu()}
 
@@ -96,7 +99,7 @@ def _point_spread_functions(camera: Camera) -> Figure:
     lens = copy.deepcopy(camera.lens).cpu()
     optics = optics_text(lens.system(), lens.primary_wavelength, views.object_distance)
     return psf_figure(
-        functions.cpu(),
+        functions.cpu().reshape(-1, *functions.shape[-3:]),  # of readouts one after the other
         [_label(label) for label in views.psf_labels()],
         views.sensor.pixel_pitch,
         f"{shown_name(lens)}: {optics}\nPSFs {views.psf_place}",
@@ -112,7 +115,7 @@ def _whole_functions(camera: Camera) -> Tensor:
         if size > _LARGEST_WINDOW:
             return found
         wider = views.point_spread_functions(lens, values, _PUPIL_SAMPLES, size=size)
-        held = found.sum((1, 2, 3)) >= _HELD * wider.sum((1, 2, 3))
+        held = found.sum((-3, -2, -1)) >= _HELD * wider.sum((-3, -2, -1))
         if bool(held.all()):
             return found
         found = wider

@@ -122,7 +122,12 @@ def loss_over_views(
 
 
 def check_reconstruction(
-    network: Restoration, loss: Loss, size: Sequence[int], functions: Sequence[int]
+    network: Restoration,
+    loss: Loss,
+    size: Sequence[int],
+    functions: int,
+    images: int | None = None,
+    readouts: int | None = None,
 ) -> None:
     """Try a network and a loss on one image before anything is trained.
 
@@ -132,24 +137,27 @@ def check_reconstruction(
         network: to be tried.
         loss: to be tried on its image.
         size: height and width of the camera's images, pixels.
-        functions: number of point spread functions that the camera gives; or 1 and their number,
-            where it gives each image its own.
+        functions: number of point spread functions that the camera gives.
+        images: 1 where it gives each image its own; None where they are those of all.
+        readouts: of an image; None: one, and no list of it.
 
     Raises:
         InputError: the network or the loss fails, or gives something else than is needed.
     """
     name = _name(network.network if isinstance(network, ImageNetwork) else network)
-    raw = torch.zeros(1, 3, *size)
+    several = [] if readouts is None else [readouts]
+    raw = torch.zeros(1, *several, 3, *size)
     psf = field = None
     if network.needs_point_spread_function:
-        psf = torch.zeros(*functions, 3, 3, 3)
+        psf = torch.zeros(*[] if images is None else [images], *several, functions, 3, 3, 3)
         psf[..., 1, 1] = 1.0
     if network.needs_field:
         field = torch.zeros(1, 2, *size)
     with evaluating(network), torch.no_grad(), torch.random.fork_rng(devices=()):
-        noise = network.noise_arguments((0.01, 1e-4))
+        level = (0.01, 1e-4)
+        noise = network.noise_arguments(level if readouts is None else [level] * readouts)
         restored = _tried("network", name, raw, lambda: network(raw, psf, field, *noise))
-        wanted = (tuple(raw.shape), network.dtype)
+        wanted = ((1, 3, *size), network.dtype)
         if not isinstance(restored, Tensor) or (tuple(restored.shape), restored.dtype) != wanted:
             raise InputError(
                 f"network: {name} gives {_described(restored)} for an image of shape "

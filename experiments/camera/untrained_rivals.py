@@ -42,16 +42,14 @@ def restored_by_rivals(
         functions: that the camera's network was told; None where it asks for none.
         values: of the lens's variables.
     """
-    if functions is None or functions.ndim == 4:  # not yet of each image its own
+    if functions is None or functions.ndim == taken.given.ndim:  # not of each image its own
         own = camera.views.functions_of_images(camera.lens, values, taken, "test")
         functions = functions if own is None else own
     if functions is None:
         functions = camera.views.point_spread_functions(camera.lens, values)
     rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
-    noise = torch.tensor(camera.views.readout.noise)
+    noise = torch.tensor(camera.views.noise)
     return {
-        name: rival(taken.raw.flatten(0, 1), functions, None, noise).unflatten(
-            0, taken.raw.shape[:2]
-        )
+        name: rival(taken.given, functions, None, noise).unflatten(0, taken.raw.shape[:2])
         for name, rival in rivals.items()
     }

@@ -33,11 +33,21 @@ class Views(NamedTuple):
         raw: (B, V, 3, H, W), linear light, read out and developed.
         field: (B, V, 2, H, W), where each pixel lies on the sensor, x and y over half its diagonal,
             by which functions of each image are found; None where that is the same for all.
+        readouts: (B, V, N, 3, H, W), where an image is read out N times; `raw` is their mean.
+        motion: (N, 2), of the scene at each state of a lens that is exposed in several, pixels down
+            and to the right.
     """
 
     truth: Tensor
     raw: Tensor
     field: Tensor | None = None
+    readouts: Tensor | None = None
+    motion: Tensor | None = None
+
+    @property
+    def given(self) -> Tensor:
+        """What restorers are given: (B·V, 3, H, W), or (B·V, N, 3, H, W) of readouts."""
+        return (self.raw if self.readouts is None else self.readouts).flatten(0, 1)
 
 
 class Comparison(NamedTuple):
@@ -84,6 +94,16 @@ class Imaging(ABC):
         # What makes the training images, with what it found of the lens.
         self._training = renderer
         self.evaluation_renderer = renderer
+
+    @property
+    def readouts(self) -> int | None:
+        """How many readouts an image has; None: one, and no list of it."""
+        return None
+
+    @property
+    def noise(self) -> Sequence[float] | Sequence[Sequence[float]]:
+        """The noise of what restorers are given, as of `Readout.noise`, or of each readout."""
+        return self.readout.noise
 
     @property
     def sensor(self) -> Sensor:
@@ -268,10 +288,17 @@ class Imaging(ABC):
         """The training's loss as a function of images of textures; None where there is none."""
         return None
 
-    def _raw(self, image: Tensor, seed: int, share: BatchShare | None = None) -> Tensor:
+    def _raw(
+        self,
+        image: Tensor,
+        seed: int,
+        share: BatchShare | None = None,
+        readout: Readout | None = None,
+    ) -> Tensor:
         """An image in linear light, read out with the noise of a seed and developed."""
+        readout = readout or self.readout
         generator = generator_of(seed + _NOISE_OFFSET, image.device)
-        return self.readout.develop(self.readout(image, generator, share))
+        return readout.develop(readout(image, generator, share))
 
     def rays(self) -> int:
         """Rays that a training image takes; 0 before a renderer is chosen."""
