@@ -1,162 +1,194 @@
-"""Measure the gain of wavefront coding over the best plain lens, against light and depth range.
+"""Measure what cameras for an extended depth of field gain over the best plain lens.
 
-    python scripts/coding_gain.py bound                # by linear filters: seconds, no training
-    python scripts/coding_gain.py train                # trains coded and plain cameras: hours
-    python scripts/coding_gain.py show outputs/coding_gain/*/* --figure coding_gain.png
+    python scripts/coding_gain.py bound                # by linear filters: a minute, no photographs
+    python scripts/coding_gain.py judge --package-folders FOLDER/usr/share --figure coding_gain.png
+    python scripts/coding_gain.py judge --families "bracket of 3" --motion 0.5 estimated
 
-The plain lens is the same one without its plate, refocused, and stopped down as far as is best on
-validation at equal exposure time; the coded one has learned plate and focus at full aperture.
+The plain lens is the same one without its plate, refocused for each light, and stopped down as far
+as validation photographs choose, at equal exposure time.  Other cameras have the settings of least
+error by linear filters: strength of the plate, foci, F-number.  All are judged by wave optics on 42
+photographs at each depth, restored by the shipped restorer: blind to depth, or choosing it by
+place.  `light` is electrons in white at F/8, read noise 3 electrons a readout.
 """
 
 import argparse
+import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import torch
+from torch import Tensor
+
 from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import format_interval
+from dolens.experiments.data.package_photographs import data_folders
 from dolens.plotting import save_figure
 from dolens.plotting.coding_gain import GainRange, coding_gain_figure
-from scripts.coding.bound import BoundGain, bound_gains
-from scripts.coding.trained import TrainedGain, trained_gains
-from scripts.finished_runs import train_unless_finished
+from scripts.coding.cameras import F_NUMBERS, Bound, DepthCamera, Range, best_of, refined
+from scripts.coding.judged import (
+    RESTORERS,
+    Motion,
+    gain_at_worst,
+    gain_of_mean,
+    restorer_of,
+    scenes_of,
+    scores_of,
+)
 
-DEPTHS = {
-    "4.5 to 8 m": (8000.0, 6000.0, 4500.0),
-    "3 m to 116 m": (116000.0, 5760.0, 2953.0),
+RANGES = {
+    "4.5 to 8 m": Range((8000.0, 6000.0, 4500.0)),
+    "3 m to 116 m": Range((116000.0, 5760.0, 2953.0)),
+    "4.5 to 8 m, 2.3 µm": Range((8000.0, 6000.0, 4500.0), 0.0023),
 }
-LIGHTS = (30.0, 100.0, 300.0, 1000.0, 3000.0, 8000.0)
-# Semi-diameters of the stop, mm: F/8 to F/22 in whole stops.
-STOPS = (6.35, 4.5, 3.18, 2.25)
+LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
+FAMILIES = (
+    "cubic",
+    "fixed cubic",
+    "quartic",
+    "sweep",
+    "bracket of 2",
+    "bracket of 3",
+    "bracket of 5",
+    "learned bracket of 3",
+)
 _READ_NOISE = 3.0  # electrons, as conf/readout/electrons.yaml has it
 
 
-def bounds(lights: Sequence[float]) -> dict[str, list[BoundGain]]:
-    """Gains by linear filters, by depth range."""
-    return {name: bound_gains(depths, lights, _READ_NOISE) for name, depths in DEPTHS.items()}
+def chosen(family: str, scene: Range, light: float, known: bool) -> tuple[DepthCamera, Bound]:
+    """Return a family's camera of least error by linear filters, and its errors."""
+    equal = family.removeprefix("learned ")
+    camera, bound = best_of(equal, scene, light, _READ_NOISE, known)
+    if equal != family:
+        camera, bound = refined(camera, scene, light, _READ_NOISE, known)
+    return camera, bound
 
 
-def bound_table(found: Mapping[str, Sequence[BoundGain]]) -> list[str]:
-    """Lines of Markdown."""
-    lines = [
-        "| depths | electrons | one filter | a filter each | best plain | best plate, mm⁻² |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, gains in found.items():
-        lines += [
-            f"| {name} | {g.light:g} | {g.common_filter:+.2f} | {g.filter_per_depth:+.2f} "
-            f"| F/{g.plain_f_number:.1f} | {g.plate:.1e} |"
-            for g in gains
+def bounds(
+    scene: Range, lights: Sequence[float], families: Sequence[str]
+) -> dict[str, list[tuple[float, float]]]:
+    """Return gains in dB over the best plain lens by family and light: with one filter for all
+    depths, and with one for each.
+    """
+    found: dict[str, list[tuple[float, float]]] = {family: [] for family in families}
+    for light in lights:
+        least = [
+            min(chosen(f"plain F/{n:g}", scene, light, known)[1][known] for n in F_NUMBERS)
+            for known in (False, True)
         ]
-    return lines
+        for family in families:
+            own = [chosen(family, scene, light, known)[1][known] for known in (False, True)]
+            common, each = (10.0 * math.log10(a / b) for a, b in zip(least, own, strict=True))
+            found[family].append((common, each))
+    return found
 
 
-def trained_table(found: Sequence[TrainedGain]) -> list[str]:
-    """Lines of Markdown."""
-    lines = [
-        "| depths (m) | electrons | validation by semi-diameter | coded | plain | gain | seeds "
-        "| photographs |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for g in found:
-        stops = ", ".join(
-            f"{'**' if s == g.chosen else ''}{s:g} mm {v:.2f}{'**' if s == g.chosen else ''}"
-            for s, v in g.stops.items()
-        )
-        depths = ", ".join(f"{depth / 1000.0:g}" for depth in g.depths)
-        lines.append(
-            f"| {depths} | {g.light:g} | {stops} | {g.coded:.2f} | {g.plain:.2f} "
-            f"| {format_interval(g.interval, 2)} | {g.interval.seeds} | {g.interval.photographs} |"
-        )
-    return lines
+def best_plain(
+    scene: Range, light: float, restorer: str, validation: Tensor
+) -> tuple[DepthCamera, dict[float, float]]:
+    """Return the plain lens that validation chooses, and its score by F-number."""
+    network, known = restorer_of(restorer), restorer == "by depth"
+    cameras = {n: chosen(f"plain F/{n:g}", scene, light, known)[0] for n in F_NUMBERS}
+    scores = {
+        n: float(scores_of(c, scene, light, _READ_NOISE, validation, network).mean(0).amin())
+        for n, c in cameras.items()
+    }
+    return cameras[max(scores, key=lambda n: scores[n])], scores
 
 
-def figure_of(
-    found: Mapping[str, Sequence[BoundGain]], trained: Sequence[TrainedGain], path: Path
+def judge(
+    scene: Range,
+    light: float,
+    restorer: str,
+    families: Sequence[str],
+    photographs: tuple[Tensor, Tensor],
+    motion: Motion,
+) -> dict[str, tuple[float, float, float]]:
+    """Print a table's rows, and return gains at the worst depth with their intervals, by family."""
+    validation, test = photographs
+    network, known = restorer_of(restorer), restorer == "by depth"
+    plain, _ = best_plain(scene, light, restorer, validation)
+    reference = scores_of(plain, scene, light, _READ_NOISE, test, network)
+    _print_row(light, restorer, plain, reference)
+    found = {}
+    for family in families:
+        camera, _ = chosen(family, scene, light, known)
+        moves = motion if len(camera.foci) > 1 and not camera.one else Motion()
+        scores = scores_of(camera, scene, light, _READ_NOISE, test, network, moves)
+        gain = gain_at_worst(scores, reference)
+        _print_row(light, restorer, camera, scores, reference)
+        found[family] = (gain.estimate, gain.low, gain.high)
+    return found
+
+
+def _print_row(
+    light: float,
+    restorer: str,
+    camera: DepthCamera,
+    scores: Tensor,
+    reference: Tensor | None = None,
 ) -> None:
-    """Write the figure: bounds as lines, trained cameras as points."""
-    ranges = []
-    for name, gains in found.items():
-        points = [
-            (g.light, g.interval.estimate, g.interval.low, g.interval.high)
-            for g in trained
-            if g.depths == DEPTHS[name]
+    means = scores.mean(dim=0)
+    depths = " / ".join(f"{value:.2f}" for value in means.tolist())
+    gains = ["", ""]
+    if reference is not None:
+        gains = [
+            format_interval(gain(scores, reference), 2) for gain in (gain_at_worst, gain_of_mean)
         ]
-        ranges.append(
-            GainRange(
-                name,
-                [g.light for g in gains],
-                [g.common_filter for g in gains],
-                [g.filter_per_depth for g in gains],
-                points,
-            )
-        )
-    title = "Gain over the best plain lens"
-    if trained:
-        title += f"; bars: 95 % intervals over {_range_of(g.interval.photographs for g in trained)}"
-        title += f" photographs, seeds: {_range_of(g.interval.seeds for g in trained)}"
-    save_figure(coding_gain_figure(ranges, title), path)
-
-
-def _range_of(counts: Iterable[int]) -> str:
-    """Return `42`, or `1 to 5` of counts that differ."""
-    found = sorted(set(counts))
-    return f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
-
-
-def train(folder: Path, lights: Sequence[float], seeds: int, others: Sequence[str]) -> None:
-    """Train every camera of every condition one after another; finished ones are left."""
-    for name, depths in DEPTHS.items():
-        for light in lights:
-            cameras = {"coded": ["experiment=wavefront_coding"]}
-            for stop in STOPS:
-                cameras[f"plain_{stop:g}"] = [
-                    "experiment=wavefront_coding_stopped_down",
-                    f"stop_semi_diameter={stop}",
-                ]
-            for camera, overrides in cameras.items():
-                for seed in range(seeds):
-                    run = folder / f"{name.replace(' ', '_')}_{light:g}" / f"{camera}_seed{seed}"
-                    own = [
-                        *overrides,
-                        f"light={light:g}",
-                        f"scene.depths={list(depths)}",
-                        f"seed={seed}",
-                    ]
-                    train_unless_finished(run, [*own, *others])
+    cells = [f"{light:g}", restorer, camera.family, camera.described(), depths, *gains]
+    print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print tables, write the figure, or train."""
+    """Print tables, and write the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    bound = commands.add_parser("bound", help="gains by linear filters")
-    show = commands.add_parser("show", help="gains of run folders beside them")
-    show.add_argument("folders", nargs="+", type=Path)
-    show.add_argument("--judge", default="wave", help="whose scores count; '' for rays")
-    training = commands.add_parser("train", help="train coded and plain cameras")
-    training.add_argument("--folder", type=Path, default=Path("outputs/coding_gain"))
-    training.add_argument("--seeds", type=int, default=1)
-    training.add_argument("overrides", nargs="*", help="of train.py, as data=package_photographs")
-    for part in (bound, show, training):
-        part.add_argument("--lights", nargs="+", type=float, default=LIGHTS, help="electrons")
-    for part in (bound, show):
-        part.add_argument("--figure", type=Path)
+    parser.add_argument("command", choices=("bound", "judge"))
+    parser.add_argument("--ranges", nargs="+", choices=RANGES, default=list(RANGES)[:2])
+    parser.add_argument("--lights", nargs="+", type=float, default=LIGHTS, help="electrons")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
+    parser.add_argument("--restorers", nargs="+", choices=RESTORERS, default=["blind", "by depth"])
+    parser.add_argument("--motion", nargs=2, default=("0", "known"), help="pixels a readout, known")
+    parser.add_argument("--package-folders", nargs="*", default=data_folders())
+    parser.add_argument("--photographs", type=int, help="of the 42, evenly chosen")
+    parser.add_argument("--figure", type=Path)
     given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
     try:
-        if given.command == "train":
-            train(given.folder, given.lights, given.seeds, given.overrides)
-            return 0
-        trained: list[TrainedGain] = []
-        if given.command == "show":
-            trained = trained_gains(given.folders, given.judge or None)
-            print("\n".join([*trained_table(trained), ""]))
-        found = bounds(given.lights)
-        print("\n".join(bound_table(found)))
+        motion = Motion(float(given.motion[0]), given.motion[1])
+        shown = []
+        for name in given.ranges:
+            scene = RANGES[name]
+            found = bounds(scene, given.lights, given.families)
+            print(f"\n{name}: gains in dB by linear filters, one for all depths / one for each\n")
+            print(f"| light | {' | '.join(found)} |\n|{'---|' * (len(found) + 1)}")
+            for number, light in enumerate(given.lights):
+                cells = [
+                    f"{rows[number][0]:+.2f} / {rows[number][1]:+.2f}" for rows in found.values()
+                ]
+                print(f"| {light:g} | {' | '.join(cells)} |")
+            points: dict[str, dict[float, tuple[float, float, float]]] = {}
+            if given.command == "judge":
+                folders = [str(folder) for folder in given.package_folders]
+                photographs = (
+                    scenes_of(folders, "val"),
+                    scenes_of(folders, "test", given.photographs),
+                )
+                print(
+                    f"\n{name}: PSNR in dB of restored photographs by depth; gains over the best "
+                    "plain lens at the worst depth and of the mean, 95 %\n\n"
+                    "| light | restored | camera | settings | depths | worst | mean |\n"
+                    "|---|---|---|---|---|---|---|"
+                )
+                for light in given.lights:
+                    for restorer in given.restorers:
+                        judged = judge(scene, light, restorer, given.families, photographs, motion)
+                        for family, gain in judged.items():
+                            points.setdefault(f"{family}, {restorer}", {})[light] = gain
+            shown.append(GainRange(name, given.lights, found, points))
         if given.figure:
-            figure_of(found, trained, given.figure)
+            save_figure(coding_gain_figure(shown), given.figure)
     except InputError as problem:
         parser.error(str(problem))
     return 0

@@ -1,73 +1,67 @@
-"""Gains of coding: over the plain lens that validation chooses, paired over photographs."""
+"""Gains of cameras for an extended depth of field over the best plain lens."""
 
-import json
+import math
 
 import pytest
 import torch
-import yaml
 
-from dolens.experiments.camera.photograph_scores import scores_by_photograph, table_name
-from dolens.experiments.comparison.run import read_run
-from dolens.experiments.tables import write_table
-from scripts.coding.bound import bound_gains
-from scripts.coding.trained import trained_gains
+from dolens.reconstruction import GeneralRestoration, psnr_db
+from scripts.coding.cameras import DepthCamera, Range, best_of, bound_of, noise_of, refined
+from scripts.coding.judged import MARGIN, SIDE, Motion, images_of
+from scripts.coding_gain import bounds
 
-DEPTHS = [8000.0, 6000.0]
-VIEWS = ("8m", "6m")
-
-
-def made(folder, experiment, validation, scores, light=100.0, **config):
-    """A run folder of a camera with scores (photographs, views) by the judge `wave`."""
-    (folder / ".hydra").mkdir(parents=True)
-    choices = {"hydra": {"runtime": {"choices": {"experiment": experiment}}}}
-    (folder / ".hydra/hydra.yaml").write_text(yaml.safe_dump(choices))
-    config = {"seed": 0, "light": light, "scene": {"depths": DEPTHS}, **config}
-    (folder / ".hydra/config.yaml").write_text(yaml.safe_dump(config))
-    scores = torch.tensor(scores)
-    names = [f"photograph {number}" for number in range(len(scores))]
-    table = scores_by_photograph({"psnr_db": scores}, names, VIEWS)
-    write_table(folder / table_name("test_wave"), table.rows())
-    metrics = {"val_wave/psnr_db/worst": validation, "test/psnr_db/worst": 99.0}
-    metrics["test_wave/psnr_db/worst"] = float(scores.mean(dim=0).min())
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    return folder
-
-
-def test_validation_chooses_the_stop_and_the_test_says_the_gain(tmp_path):
-    stopped = "wavefront_coding_stopped_down"
-    folders = [
-        made(tmp_path / "a", "wavefront_coding", 26.0, [[25.0, 26.0], [29.0, 28.5]]),
-        made(tmp_path / "b", "wavefront_coding_refocused", 23.0, [[22.0, 24.0], [26.0, 26.0]]),
-        made(tmp_path / "c", stopped, 25.5, [[24.0, 25.0], [28.0, 28.0]], stop_semi_diameter=4.5),
-        # Better in the test, and not chosen: validation says otherwise.
-        made(tmp_path / "d", stopped, 25.0, [[26.0, 27.0], [30.0, 30.0]], stop_semi_diameter=3.2),
-        made(tmp_path / "e", "wavefront_coding_fixed_plate", 30.0, [[40.0, 40.0], [40.0, 40.0]]),
-        made(tmp_path / "f", "wavefront_coding", 26.0, [[25.0, 26.0], [29.0, 28.5]], light=50.0),
-    ]
-    (found,) = trained_gains(folders, "wave")
-    assert (found.light, found.depths, found.chosen) == (100.0, tuple(DEPTHS), 4.5)
-    assert found.stops == {3.2: 25.0, 4.5: 25.5, 6.35: 23.0}
-    # The worst view's means, 27.0 (8 m) and 26.0 (8 m).
-    assert (found.coded, found.plain) == (27.0, 26.0)
-    assert found.interval.estimate == pytest.approx(1.0)
-    assert found.interval.low <= 1.0 <= found.interval.high
-    assert (found.interval.seeds, found.interval.photographs) == (1, 2)
-
-
-def test_a_judge_s_metrics_stand_for_the_test_s(tmp_path):
-    folder = made(tmp_path / "a", "wavefront_coding", 26.0, [[25.0, 26.0]])
-    assert read_run(folder).metrics["test/psnr_db/worst"] == 99.0
-    judged = read_run(folder, "wave")
-    assert judged.metrics["test/psnr_db/worst"] == 25.0
-    assert judged.scores.metrics["psnr_db"].tolist() == [[25.0, 26.0]]
+NEAR = Range((8000.0, 6000.0, 4500.0))
 
 
 def test_linear_bounds_find_the_textbook_s_tendencies():
-    dim, bright = bound_gains([8000.0, 6000.0, 4500.0], [50.0, 5000.0], 3.0, (0.0,))
+    def plain(light):
+        found = (best_of(f"plain F/{n}", NEAR, light, 3.0, False) for n in ("8", "11", "16", "22"))
+        return min(found, key=lambda pair: pair[1].common)[0].f_number
+
     # The brighter, the further a plain lens is stopped down.
-    assert bright.plain_f_number > dim.plain_f_number > 8.5
+    assert plain(5000.0) > plain(50.0) >= 8.0
+    gains = bounds(NEAR, (50.0, 5000.0), ("cubic",))["cubic"]
     # Where the depth is known a plate gains more, and the more so the brighter it is.
-    assert bright.filter_per_depth > dim.filter_per_depth > dim.common_filter
+    assert gains[1][1] > gains[0][1] > gains[0][0]
     # One plane needs no plate: the weakest is best, and gains nothing.
-    (flat,) = bound_gains([5760.0], [1000.0], 3.0, (0.0,))
-    assert flat.plate == 0.5e-5 and flat.common_filter <= 0.0
+    one = Range((5760.0,))
+    camera, error = best_of("cubic", one, 1000.0, 3.0, False)
+    assert camera.plate["x3"] == 0.5e-5
+    assert error.common >= best_of("plain F/8", one, 1000.0, 3.0, False)[1].common
+
+
+def test_readouts_at_one_focus_are_one_exposure_that_pays_read_noise_as_often():
+    thrice = DepthCamera("bracket of 3", 8.0, (95.86,) * 3)
+    once = DepthCamera("plain F/8", 8.0, (95.86,))
+    assert noise_of(thrice, 300.0, 3.0) == pytest.approx((0.01, 9.0e-4))
+    for read in (0.0, 3.0):
+        # The mean of three has three times the read noise's variance.
+        alone = bound_of(once, NEAR, 300.0, math.sqrt(3.0) * read)
+        assert bound_of(thrice, NEAR, 300.0, read) == pytest.approx(alone, rel=1e-4)
+
+
+def test_free_foci_are_better_than_those_that_they_begin_with():
+    camera = DepthCamera("bracket of 2", 8.0, (95.5, 96.1))
+    found, error = refined(camera, NEAR, 1000.0, 3.0, True)
+    assert error.each < bound_of(camera, NEAR, 1000.0, 3.0).each
+    assert found.family == "learned bracket of 2" and found.foci[0] < found.foci[1]
+
+
+def test_a_bracket_restores_what_one_focus_loses_and_ignored_motion_costs():
+    generator = torch.Generator().manual_seed(0)
+    side = SIDE + 2 * MARGIN
+    noise = torch.fft.rfft2(torch.randn(1, 3, side, side, generator=generator))
+    down, right = torch.fft.fftfreq(side)[:, None], torch.fft.rfftfreq(side)
+    light = torch.fft.irfft2(noise / (down**2 + right**2 + 1e-4).sqrt(), s=(side, side))
+    scenes = (0.35 + 0.12 * light / light.std()).clamp(0.02, 1.0)
+    network = GeneralRestoration(by_depth=True).eval()
+
+    def score(camera, motion=None):
+        found = images_of(camera, NEAR, 0, 1000.0, 3.0, scenes, network, motion)
+        return float(psnr_db(found.restored, found.truth).mean())
+
+    bracket = DepthCamera("bracket of 3", 8.0, (95.3, 95.82, 96.29))
+    still = score(bracket)
+    assert still > score(DepthCamera("plain F/11", 11.0, (95.82,))) + 1.0
+    ignored = score(bracket, Motion(1.0, "ignored"))
+    assert still - 0.5 < score(bracket, Motion(1.0, "estimated")) > ignored + 1.0

@@ -1,7 +1,7 @@
-"""The gain of a coded aperture over a plain lens is plotted against light, for each depth range."""
+"""Gains of cameras for an extended depth of field are plotted against light, by depth range."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -14,21 +14,21 @@ from dolens.plotting.titles import draw_title
 
 @dataclass(frozen=True)
 class GainRange:
-    """A `GainRange` holds the gains (dB) of one depth range.
+    """A `GainRange` holds the gains (dB) of cameras at one depth range.
 
     Attributes:
         label: of the range, as `4.5 to 8 m`.
-        lights: of the bound, electrons of a white pixel at full aperture.
-        common_filter: the bound's gain with one linear filter for all depths.
-        filter_per_depth: the bound's gain with a linear filter for each depth.
-        trained: light, gain, and the lower and upper end of its interval, of trained cameras.
+        lights: of the bounds, electrons of a white pixel at full aperture.
+        bounds: camera → for each light the bound's gain with one linear filter for all depths, and
+            with one for each.
+        judged: camera and restorer, as `sweep, blind` → light → gain, and the lower and upper end
+            of its interval.
     """
 
     label: str
     lights: Sequence[float] = ()
-    common_filter: Sequence[float] = ()
-    filter_per_depth: Sequence[float] = ()
-    trained: Sequence[tuple[float, float, float, float]] = ()
+    bounds: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
+    judged: Mapping[str, Mapping[float, tuple[float, float, float]]] = field(default_factory=dict)
 
 
 def coding_gain_figure(
@@ -36,41 +36,48 @@ def coding_gain_figure(
 ) -> Figure:
     """Plot gain against light, with axes for each depth range.
 
-    Lines are bounds of linear restoration; points with bars are trained cameras with their
-    intervals.
+    Lines are bounds of linear restoration, whole with one filter for all depths and dashed with one
+    for each; points with bars are photographs with their intervals, full where the restorer is
+    blind to depth and empty where it chooses the depth.
 
     Args:
         ranges: one or more.
         title: above all.
     """
-    figure = Figure(figsize=(max(PAGE * len(ranges) / 2.0, 4.6), 3.4), layout="constrained")
+    figure = Figure(figsize=(max(PAGE * len(ranges) / 2.0, 4.6), 3.9), layout="constrained")
     grid = figure.subplots(1, len(ranges), squeeze=False, sharey=True, sharex=True)
-    blue, orange, green = colours(3)
+    names = list(dict.fromkeys(name for found in ranges for name in found.bounds))
+    names += [
+        n for n in dict.fromkeys(_camera(j) for r in ranges for j in r.judged) if n not in names
+    ]
+    colour = dict(zip(names, colours(len(names)), strict=True))
     for axes, found in zip(grid[0], ranges, strict=True):
         axes.axhline(0.0, color="0.3", linewidth=0.8)
-        if len(found.lights):
-            axes.plot(
-                found.lights, found.common_filter, color=blue, label="bound, one linear filter"
-            )
+        for name, gains in found.bounds.items():
+            common, each = zip(*gains, strict=True)
+            axes.plot(found.lights, common, color=colour[name], label=f"{name}, one linear filter")
             axes.plot(
                 found.lights,
-                found.filter_per_depth,
-                color=green,
+                each,
+                color=colour[name],
                 ls="--",
-                label="bound, a filter for each depth",
+                label=f"{name}, a filter for each depth",
             )
-        if found.trained:
-            light, gain, low, high = zip(*found.trained, strict=True)
+        for name, points in found.judged.items():
+            light, gain, low, high = zip(*((k, *v) for k, v in points.items()), strict=True)
             below = [g - bottom for g, bottom in zip(gain, low, strict=True)]
             above = [top - g for g, top in zip(gain, high, strict=True)]
+            own = colour[_camera(name)]
             axes.errorbar(
                 light,
                 gain,
                 (below, above),
                 fmt="o",
-                color=orange,
-                capsize=3,
-                label="trained cameras",
+                color=own,
+                markerfacecolor="white" if name.endswith("by depth") else own,
+                markersize=4,
+                capsize=2,
+                label=name,
             )
         axes.set_xscale("log")
         axes.set_title(found.label, fontsize=SMALL + 1)
@@ -84,6 +91,11 @@ def coding_gain_figure(
     for axes in grid[0]:
         handles |= {label: h for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if handles:
-        legend_below(figure, list(handles.values()), len(handles), list(handles))
+        legend_below(figure, list(handles.values()), 3, list(handles))
     draw_title(figure, title)
     return figure
+
+
+def _camera(name: str) -> str:
+    """Return the camera of `sweep, blind`."""
+    return name.rpartition(", ")[0]

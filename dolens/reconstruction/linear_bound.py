@@ -65,15 +65,30 @@ def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearErr
     Returns:
         errors of D depths.
     """
+    return linear_error_of_readouts(functions.unsqueeze(-4), spectrum, noise)
+
+
+def linear_error_of_readouts(functions: Tensor, spectrum: Tensor, noise: float) -> LinearError:
+    """Return the least errors of restoring an image that was read out several times.
+
+    As `linear_error`, with a filter for each readout: |1 - Σ_n W_n·H_nd|²·S + Σ_n |W_n|²·N, and
+    sums over n of mean|H_nd|².
+
+    Args:
+        functions: (..., readouts, D, K, K), scaled so that all have the same noise; see
+            `readouts_of`.
+        spectrum: (R, C // 2 + 1) with C = R even and at least K.
+        noise: N.
+    """
     rows = spectrum.shape[-2]
     # The place of the origin changes the phase of all depths alike, and no error.
     transfer = torch.fft.rfft2(functions, s=(rows, rows))
-    power = transfer.real.square() + transfer.imag.square()
-    common_filter = spectrum * transfer.mean(-3, keepdim=True).conj()
-    common_filter = common_filter / (spectrum * power.mean(-3, keepdim=True) + noise)
-    residual = 1.0 - common_filter * transfer
+    power = (transfer.real.square() + transfer.imag.square()).sum(-4)
+    filters = spectrum * transfer.mean(-3, keepdim=True).conj()
+    filters = filters / (spectrum * power.mean(-3, keepdim=True) + noise).unsqueeze(-4)
+    residual = 1.0 - (filters * transfer).sum(-4)
     left = spectrum * (residual.real.square() + residual.imag.square())
-    left = left + noise * (common_filter.real.square() + common_filter.imag.square())
+    left = left + noise * (filters.real.square() + filters.imag.square()).sum(-4)
     own = spectrum * noise / (spectrum * power + noise)
     return LinearError(_mean(left, rows), _mean(own, rows))
 

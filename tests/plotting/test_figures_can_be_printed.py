@@ -268,7 +268,8 @@ def test_tolerances():
 
 def test_gain_against_light():
     lights = [30.0, 100.0, 1000.0]
-    found = GainRange("4.5 to 8 m", lights, [0.1] * 3, [0.5] * 3, [(100.0, 0.2, -0.1, 0.4)])
+    points = {"sweep, blind": {100.0: (0.2, -0.1, 0.4)}}
+    found = GainRange("4.5 to 8 m", lights, {"sweep": [(0.1, 0.5)] * 3}, points)
     figure = coding_gain_figure([found, found])
     assert not flaws(figure)
     assert math.isfinite(drawn_points(figure.axes[0]).sum())
