@@ -67,6 +67,7 @@ def margin_of(
     device: torch.device,
     largest: int = _LARGEST_PROBE,
     noise: Sequence[Tensor] = (),
+    readouts: int | None = None,
 ) -> int | None:
     """Measure how far the network looks, in pixels, as a multiple of `GRID`.
 
@@ -76,6 +77,7 @@ def margin_of(
         device: of both.
         largest: side of the largest probe image, pixels.
         noise: of the sensor, where the network asks for it; see `Camera.noise`.
+        readouts: of an image; None: one, and no list of it.
 
     Returns:
         The margin; None where the network looks farther than half the largest probe, as one does
@@ -85,7 +87,7 @@ def margin_of(
         return None
     size = _FIRST_PROBE
     while size <= largest:
-        reach = _reach(network, functions, size, device, noise)
+        reach = _reach(network, functions, size, device, noise, readouts)
         # Near the probe's edge less is seen than there would be.
         if reach < size // 2 - GRID // 2:
             return max(GRID, GRID * math.ceil(reach / GRID))
@@ -99,13 +101,15 @@ def _reach(
     size: int,
     device: torch.device,
     noise: Sequence[Tensor],
+    readouts: int | None,
 ) -> int:
     """The distance, by rows or columns, beyond which raw pixels hardly change the middle ones."""
     # In double precision: rounding in a transform would look like an influence of all pixels.
     network = copy.deepcopy(network).double()
     options = {"dtype": torch.float64, "device": device}
     generator = torch.Generator().manual_seed(0)
-    raw = torch.rand(1, 3, size, size, generator=generator).to(**options).requires_grad_(True)
+    shape = (1, 3, size, size) if readouts is None else (1, readouts, 3, size, size)
+    raw = torch.rand(shape, generator=generator).to(**options).requires_grad_(True)
     field = torch.zeros(1, 2, size, size, **options) if network.needs_field else None
     functions = None if functions is None else functions.double()
     middle, farthest = size // 2, 0
@@ -119,8 +123,8 @@ def _reach(
             rows = (torch.arange(size, device=device) - row).abs()
             columns = (torch.arange(size, device=device) - column).abs()
             distance = torch.maximum(rows[:, None], columns)
-            alike = gradient[0].sum(dim=0)
-            each = gradient[0].square().sum(dim=0)
+            alike = gradient[0].flatten(0, -3).sum(dim=0)
+            each = gradient[0].flatten(0, -3).square().sum(dim=0)
             together = _beyond(distance, alike).abs(), _beyond(distance, each).sqrt()
             counts = torch.nonzero(torch.maximum(*together) > _INFLUENCE).flatten()
             farthest = max(farthest, int(counts[-1]) + 1 if len(counts) else 0)
@@ -148,7 +152,7 @@ def restore_in_windows(
 
     Args:
         network: the camera's.
-        raw: (1, 3, H, W), linear light.
+        raw: (1, 3, H, W), linear light, or of readouts (1, N, 3, H, W).
         functions: point spread functions, where the network asks for them.
         field: (1, 2, H, W), where it asks for places.
         window: pixels along each side of what is kept of a window, a multiple of 64.
@@ -167,7 +171,7 @@ def restore_in_windows(
     with evaluating(network):
         if margin is None:
             return network(raw, functions, field, *noise)
-        found = torch.empty(raw.shape, dtype=network.dtype, device=raw.device)
+        found = torch.empty(1, 3, height, width, dtype=network.dtype, device=raw.device)
         inner = slice(margin, -margin)
         for part in windows(height, width, window):
             (top, bottom), (left, right) = part.rows, part.columns

@@ -150,7 +150,7 @@ def written(
     Args:
         images: truth, sensor and restored, each (3, H, W), display-encoded, and the map of depths
             if there is one.
-        signal: what the sensor gave, (1 or 3, H, W).
+        signal: what the sensor gave, (1 or 3, H, W), or of N readouts (N, 1 or 3, H, W).
         depth: of the picture, mm.
         name: that files begin with.
         folder: that they are written to.
@@ -171,7 +171,7 @@ def written(
         write_picture(files[-1], images["depth"], 8)
     if options.save_raw:
         files.append(folder / f"{name}_raw.npy")
-        np.save(files[-1], signal.permute(1, 2, 0).squeeze(-1).float().cpu().numpy())
+        np.save(files[-1], signal.movedim(-3, -1).squeeze(-1).float().cpu().numpy())
     where = f"{depth / 1000.0:g} m" if math.isfinite(depth) else "infinity"
     title = f"{name.removesuffix(f'_{label(depth)}')} at {where}"
     numbers = {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]}

@@ -65,6 +65,8 @@ class PictureCamera:
                 f"network: {type(self.camera.network).__name__} takes no noise, with which "
                 "pictures of a field are restored by place"
             )
+        if options.raw and self.camera.views.readouts:
+            raise InputError("--raw: a camera of several readouts; allowed: pictures")
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.camera.to(device)
         self.device = device
@@ -76,7 +78,8 @@ class PictureCamera:
         if self.camera.knows_places:
             return
         noise = self.camera.noise()
-        self.margin = margin_of(self.camera.network, self.functions, device, noise=noise)
+        network, several = self.camera.network, self.camera.views.readouts
+        self.margin = margin_of(network, self.functions, device, noise=noise, readouts=several)
         if self.margin is None:
             logger.warning(
                 "The network looks farther than 200 pixels around each, or one cannot tell: "
@@ -127,10 +130,11 @@ class PictureCamera:
         taken = views.whole_picture(self.camera.lens, self.values, linear, placing)
         generator = torch.Generator(taken.image.device).manual_seed(options.seed)
         with torch.no_grad():
-            signal = views.readout(taken.image, generator)
+            signal = views.sensed(taken.image, generator)
+        light = views.developed(signal)
         images = {
             "truth": taken.truth[0],
-            "sensor": linear_to_srgb(views.readout.develop(signal))[0],
+            "sensor": linear_to_srgb(light if views.readouts is None else light.mean(dim=1))[0],
             "restored": self._restored(signal, taken.field, placing),
         }
         files, metrics = written(images, signal[0], depth, name, folder, options)
@@ -158,7 +162,9 @@ class PictureCamera:
     def _restored(
         self, signal: Tensor, field: Tensor | None, placing: Placing | None = None
     ) -> Tensor:
-        """The picture (3, H, W) of a signal (1, C, H, W), display-encoded."""
+        """The picture (3, H, W) of a signal (1, C, H, W), or (1, N, C, H, W) of readouts,
+        display-encoded.
+        """
         camera, readout = self.camera, self.camera.views.readout
         if camera.knows_places:
             size = (signal.shape[-2], signal.shape[-1])
@@ -169,7 +175,7 @@ class PictureCamera:
             with evaluating(camera.network):
                 found = restore_whole_picture(camera.network, signal[0], readout, *told)
             return found.clamp(0.0, 1.0)
-        raw = readout.develop(signal)
+        raw = camera.views.developed(signal)
         settings = (self.window, self.margin, camera.noise())
         found = restore_in_windows(camera.network, raw, self.functions, field, *settings)
         return found[0].clamp(0.0, 1.0)

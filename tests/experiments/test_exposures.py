@@ -9,8 +9,13 @@ from hydra.utils import instantiate
 
 from dolens.errors import InputError
 from dolens.experiments.camera.exportable import exportable
+from dolens.experiments.commands.apply import apply_run
+from dolens.experiments.commands.apply_options import Options
+from dolens.experiments.commands.picture_files import write_picture
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
+from dolens.sensor.colour import linear_to_srgb
+from tests.experiments.conftest import finished_run
 from tests.experiments.tiny_experiment import TINY, figure_names
 from tests.reconstruction.test_readouts import textured
 
@@ -195,6 +200,18 @@ def test_a_bracket_trains_and_is_judged_beside_untrained_restorers(composed, tmp
     foci = [metrics[f"variables/states.{name}.sensor_distance"] for name in ("far", "near")]
     assert foci != [95.5, 96.25]
     assert {"images", "point_spread_functions", "layout"} <= figure_names(tmp_path / "run")
+
+
+def test_a_bracket_is_applied_to_whole_pictures_at_rest(root, tmp_path):
+    """Its sensor's picture is the mean of the readouts, and what is restored is of all of them."""
+    untrained = ("network=wiener_tv", "train=false", "light=1000")
+    folder = finished_run(root, tmp_path, *BRACKET, *untrained)
+    picture = tmp_path / "scene.png"
+    write_picture(picture, linear_to_srgb(texture()[0].float().repeat(1, 2, 2)), 16)
+    _, _, (made,) = apply_run(folder, [picture], Options())
+    assert made.metrics["psnr_db"] > made.metrics["raw_psnr_db"]
+    with pytest.raises(InputError, match="--raw: a camera of several readouts"):
+        apply_run(folder, [picture], Options(raw=True))
 
 
 @pytest.mark.parametrize(

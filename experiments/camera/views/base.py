@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
+import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
@@ -299,6 +300,16 @@ class Imaging(ABC):
         readout = readout or self.readout
         generator = generator_of(seed + _NOISE_OFFSET, image.device)
         return readout.develop(readout(image, generator, share))
+
+    def sensed(self, image: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what the sensor gives for light (1, 3, H, W): (1, C, H, W), or of each of N
+        readouts (1, N, C, H, W), from an image of each.
+        """
+        return self.readout(image, generator)
+
+    def developed(self, signal: Tensor) -> Tensor:
+        """Return the linear light of what the sensor gave, as restorers are given it."""
+        return self.readout.develop(signal)
 
     def rays(self) -> int:
         """Rays that a training image takes; 0 before a renderer is chosen."""

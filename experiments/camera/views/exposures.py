@@ -12,6 +12,7 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.experiments.checks import check_positive
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import values_there
@@ -264,6 +265,41 @@ class ExposedViews(Imaging):
             return torch.stack(list(states), dim=dim)
         weighted = [s * one for s, one in zip(self.shares.values(), states, strict=True)]
         return torch.stack(weighted).sum(dim=0)
+
+    def whole_picture(
+        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
+    ) -> WholePicture:
+        """Image a picture at rest in every state; see `Imaging.whole_picture`.
+
+        Raises:
+            InputError: the views know the place in the field.
+        """
+        if self.view_is_known:
+            raise InputError("exposures: whole pictures of a field; allowed: exposures=null")
+        found = [
+            part.whole_picture(
+                lens.in_state(name), values_there(lens, name, values), picture, placing
+            )
+            for name, part in self.parts.items()
+        ]
+        images = torch.stack([one.image for one in found], dim=1)
+        weights = images.new_tensor(list(self.shares.values()))
+        swept = torch.einsum("n,bnchw->bchw", weights, images)
+        return found[0]._replace(image=images if self._several else swept)
+
+    def sensed(self, image: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what the sensor gives; see `Imaging.sensed`."""
+        if not self._several:
+            return super().sensed(image, generator)
+        each = zip(self.shares.values(), image.unbind(1), strict=True)
+        return torch.stack([self._readout(s)(one, generator) for s, one in each], dim=1)
+
+    def developed(self, signal: Tensor) -> Tensor:
+        """Return the linear light of what the sensor gave."""
+        if not self._several:
+            return super().developed(signal)
+        each = zip(self.shares.values(), signal.unbind(1), strict=True)
+        return torch.stack([self._readout(s).develop(one) for s, one in each], dim=1)
 
     def reference_renderers(self) -> Sequence[str]:
         """Names of renderers that make the test images besides."""
