@@ -2,13 +2,15 @@
 
     python scripts/coding_gain.py bound                # by linear filters: a minute, no photographs
     python scripts/coding_gain.py judge --package-folders FOLDER/usr/share --figure coding_gain.png
-    python scripts/coding_gain.py judge --families "bracket of 3" --motion 0.5 estimated
+    python scripts/coding_gain.py judge --families "bracket of 3" --motions 0:known 0.5:estimated
+    python scripts/coding_gain.py scene --lights 1000 --figure scene.png
 
 The plain lens is the same one without its plate, refocused for each light, and stopped down as far
 as validation photographs choose, at equal exposure time.  Other cameras have the settings of least
-error by linear filters: strength of the plate, foci, F-number.  All are judged by wave optics on 42
-photographs at each depth, restored by the shipped restorer: blind to depth, or choosing it by
-place.  `light` is electrons in white at F/8, read noise 3 electrons a readout.
+error by linear filters: strength of the plate, foci, F-number; validation moves all of a camera's
+foci together by a step.  All are judged by wave optics on 42 photographs at each depth, restored by
+the shipped restorer: blind to depth, or choosing it by place.  `light` is electrons in white at
+F/8, read noise 3 electrons a readout.
 """
 
 import argparse
@@ -27,13 +29,23 @@ from dolens.experiments.camera.photograph_scores import format_interval
 from dolens.experiments.data.package_photographs import data_folders
 from dolens.plotting import save_figure
 from dolens.plotting.coding_gain import GainRange, coding_gain_figure
-from scripts.coding.cameras import F_NUMBERS, Bound, DepthCamera, Range, best_of, refined
+from scripts.coding.cameras import (
+    F_NUMBERS,
+    Bound,
+    DepthCamera,
+    Range,
+    best_of,
+    refined,
+    refocused,
+)
 from scripts.coding.judged import (
     RESTORERS,
     Motion,
     gain_at_worst,
     gain_of_mean,
     restorer_of,
+    scene_figure,
+    scene_of,
     scenes_of,
     scores_of,
 )
@@ -85,17 +97,17 @@ def bounds(
     return found
 
 
-def best_plain(
-    scene: Range, light: float, restorer: str, validation: Tensor
-) -> tuple[DepthCamera, dict[float, float]]:
-    """Return the plain lens that validation chooses, and its score by F-number."""
-    network, known = restorer_of(restorer), restorer == "by depth"
-    cameras = {n: chosen(f"plain F/{n:g}", scene, light, known)[0] for n in F_NUMBERS}
-    scores = {
-        n: float(scores_of(c, scene, light, _READ_NOISE, validation, network).mean(0).amin())
-        for n, c in cameras.items()
-    }
-    return cameras[max(scores, key=lambda n: scores[n])], scores
+def best_on_validation(
+    cameras: Sequence[DepthCamera], scene: Range, light: float, restorer: str, validation: Tensor
+) -> DepthCamera:
+    """Return the camera whose worst depth is best on validation photographs."""
+    network = restorer_of(restorer)
+
+    def score(camera: DepthCamera) -> float:
+        found = scores_of(camera, scene, light, _READ_NOISE, validation, network)
+        return float(found.mean(0).amin())
+
+    return max(cameras, key=score)
 
 
 def judge(
@@ -104,23 +116,59 @@ def judge(
     restorer: str,
     families: Sequence[str],
     photographs: tuple[Tensor, Tensor],
-    motion: Motion,
+    motions: Sequence[Motion],
 ) -> dict[str, tuple[float, float, float]]:
     """Print a table's rows, and return gains at the worst depth with their intervals, by family."""
     validation, test = photographs
     network, known = restorer_of(restorer), restorer == "by depth"
-    plain, _ = best_plain(scene, light, restorer, validation)
+    stops = [chosen(f"plain F/{n:g}", scene, light, known)[0] for n in F_NUMBERS]
+    judges = (scene, light, restorer, validation)
+    plain = best_on_validation(stops, *judges)
+    plain = best_on_validation(refocused(plain, scene), *judges)
     reference = scores_of(plain, scene, light, _READ_NOISE, test, network)
     _print_row(light, restorer, plain, reference)
     found = {}
     for family in families:
         camera, _ = chosen(family, scene, light, known)
-        moves = motion if len(camera.foci) > 1 and not camera.one else Motion()
-        scores = scores_of(camera, scene, light, _READ_NOISE, test, network, moves)
-        gain = gain_at_worst(scores, reference)
-        _print_row(light, restorer, camera, scores, reference)
-        found[family] = (gain.estimate, gain.low, gain.high)
+        camera = best_on_validation(refocused(camera, scene), *judges)
+        several = len(camera.foci) > 1 and not camera.one
+        for motion in motions if several else (Motion(),):
+            scores = scores_of(camera, scene, light, _READ_NOISE, test, network, motion)
+            gain = gain_at_worst(scores, reference)
+            moving = f", motion {motion.pixels:g} {motion.knowledge}" if motion.pixels else ""
+            _print_row(light, restorer, camera, scores, reference, moving)
+            found[f"{family}{moving}"] = (gain.estimate, gain.low, gain.high)
     return found
+
+
+def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], file: Path) -> int:
+    """Write the figure of three photographs side by side, at the three depths of the first range.
+
+    Raises:
+        InputError: no file is given.
+    """
+    if file is None:
+        raise InputError("scene: --figure FILE is missing")
+    name, scene = next(iter(RANGES.items()))
+    validation, test = (scenes_of([str(f) for f in folders], split) for split in ("val", "test"))
+    # Those of most detail.
+    detail = test.diff(dim=-1).abs().mean((1, 2, 3))
+    photographs = test[detail.argsort(descending=True)[: len(scene.depths)]]
+    restorer = "by depth"
+    judges = (scene, light, restorer, validation)
+    stops = [chosen(f"plain F/{n:g}", scene, light, True)[0] for n in F_NUMBERS]
+    plain = best_on_validation(stops, *judges)
+    cameras = [plain, *(chosen(family, scene, light, True)[0] for family in families)]
+    network = restorer_of(restorer)
+    rows = {
+        f"{c.family}, F/{c.f_number:g}": scene_of(
+            c, scene, light, _READ_NOISE, photographs, network
+        )
+        for c in cameras
+    }
+    depths = ", ".join(f"{depth / 1e3:g}" for depth in scene.depths)
+    save_figure(scene_figure(rows, f"{name}: {depths} m; {light:g} electrons in white"), file)
+    return 0
 
 
 def _print_row(
@@ -129,6 +177,7 @@ def _print_row(
     camera: DepthCamera,
     scores: Tensor,
     reference: Tensor | None = None,
+    note: str = "",
 ) -> None:
     means = scores.mean(dim=0)
     depths = " / ".join(f"{value:.2f}" for value in means.tolist())
@@ -137,26 +186,29 @@ def _print_row(
         gains = [
             format_interval(gain(scores, reference), 2) for gain in (gain_at_worst, gain_of_mean)
         ]
-    cells = [f"{light:g}", restorer, camera.family, camera.described(), depths, *gains]
+    cells = [f"{light:g}", restorer, camera.family + note, camera.described(), depths, *gains]
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print tables, and write the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("command", choices=("bound", "judge"))
+    parser.add_argument("command", choices=("bound", "judge", "scene"))
     parser.add_argument("--ranges", nargs="+", choices=RANGES, default=list(RANGES)[:2])
     parser.add_argument("--lights", nargs="+", type=float, default=LIGHTS, help="electrons")
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--restorers", nargs="+", choices=RESTORERS, default=["blind", "by depth"])
-    parser.add_argument("--motion", nargs=2, default=("0", "known"), help="pixels a readout, known")
+    parser.add_argument("--motions", nargs="+", default=["0:known"], help="pixels:what is known")
     parser.add_argument("--package-folders", nargs="*", default=data_folders())
     parser.add_argument("--photographs", type=int, help="of the 42, evenly chosen")
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     try:
-        motion = Motion(float(given.motion[0]), given.motion[1])
+        pairs = [text.split(":") for text in given.motions]
+        motions = [Motion(float(pixels), knowledge) for pixels, knowledge in pairs]
+        if given.command == "scene":
+            return draw_scene(given.lights[0], given.families, given.package_folders, given.figure)
         shown = []
         for name in given.ranges:
             scene = RANGES[name]
@@ -183,7 +235,7 @@ def main(arguments: Sequence[str]) -> int:
                 )
                 for light in given.lights:
                     for restorer in given.restorers:
-                        judged = judge(scene, light, restorer, given.families, photographs, motion)
+                        judged = judge(scene, light, restorer, given.families, photographs, motions)
                         for family, gain in judged.items():
                             points.setdefault(f"{family}, {restorer}", {})[light] = gain
             shown.append(GainRange(name, given.lights, found, points))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -185,8 +185,7 @@ def refined(
     """Return a camera whose foci are free, by steps of coordinates that halve, and its errors."""
 
     def error(foci: Sequence[float]) -> float:
-        tried = DepthCamera(camera.family, camera.f_number, tuple(foci), camera.plate, camera.one)
-        found = bound_of(tried, scene, light, read_noise)
+        found = bound_of(replace(camera, foci=tuple(foci)), scene, light, read_noise)
         return found.each if known else found.common
 
     foci, step = list(camera.foci), 0.08
@@ -200,9 +199,17 @@ def refined(
                 if now < least:
                     foci, least = trial, now
         step = step if least < before else step / 2.0
-    free = f"learned {camera.family}"
-    found = DepthCamera(free, camera.f_number, tuple(foci), camera.plate, camera.one)
+    found = replace(camera, family=f"learned {camera.family}", foci=tuple(foci))
     return found, bound_of(found, scene, light, read_noise)
+
+
+def refocused(camera: DepthCamera, scene: Range) -> list[DepthCamera]:
+    """Return a camera, and those whose foci are all a step nearer or farther."""
+    foci = foci_of(scene)
+    step = foci[1] - foci[0]
+    return [
+        replace(camera, foci=tuple(z + k * step for z in camera.foci)) for k in (0.0, -1.0, 1.0)
+    ]
 
 
 @torch.no_grad()

@@ -1,14 +1,17 @@
 """Cameras for an extended depth of field are judged on photographs, by wave optics."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.experiments.data.package_photographs import PackagePhotographsDataModule
 from dolens.experiments.pretraining.examples import blurred
+from dolens.plotting.style import PAGE, SMALL
+from dolens.plotting.titles import draw_title
 from dolens.reconstruction import GeneralRestoration, Restoration, WienerTVRestoration, psnr_db
 from dolens.reconstruction.intervals import Interval, gain_interval
 from dolens.reconstruction.motion import estimated_motion
@@ -20,6 +23,7 @@ from scripts.coding.cameras import DepthCamera, Range, noise_of, wave_functions
 SIDE, MARGIN, SCALE = 128, 64, 1.5
 # Pixels along each side of functions beyond which light is cut off: the margin's.
 _LARGEST = 2 * MARGIN + 1
+_INNER = (..., slice(MARGIN, MARGIN + SIDE), slice(MARGIN, MARGIN + SIDE))
 RESTORERS = ("blind", "by depth", "tv")
 
 
@@ -104,18 +108,12 @@ def images_of(
     readout = _readout(camera, light, read_noise)
     noise = torch.tensor([readout.noise] * count)
     generator = torch.Generator().manual_seed(depth)
-    inner = (..., slice(MARGIN, MARGIN + SIDE), slice(MARGIN, MARGIN + SIDE))
-    truth, raws, found = linear_to_srgb(scenes[inner]), [], []
+    truth, raws, found = linear_to_srgb(scenes[_INNER]), [], []
     for photograph in scenes:
         angle = 2.0 * math.pi * torch.rand((), generator=generator)
         steps = (torch.arange(count) - count // 2)[:, None]
         moves = motion.pixels * steps * torch.stack([angle.sin(), angle.cos()])
-        images = []
-        for move, own in zip(moves, told[:, depth], strict=True):
-            there = shifted(photograph, move) if motion.pixels else photograph
-            image = blurred(there[None], own)[inner][0].clamp(min=0.0)
-            images.append(readout.develop(readout(image, generator)))
-        stack, own = torch.stack(images)[None], told
+        stack, own = _exposed(photograph, told[:, depth], moves, readout, generator), told
         if motion.pixels and motion.knowledge != "ignored":
             if motion.knowledge == "estimated":
                 reach = max(2.0, 2.0 * motion.pixels * count)
@@ -157,6 +155,73 @@ def gain_of_mean(camera: Tensor, other: Tensor) -> Interval:
     """Return the gain of the means over depths."""
     generator = torch.Generator().manual_seed(0)
     return gain_interval(camera[None], other[None], lambda m: m.mean(-1), generator)
+
+
+@torch.no_grad()
+def scene_of(
+    camera: DepthCamera,
+    scene: Range,
+    light: float,
+    read_noise: float,
+    photographs: Tensor,
+    network: Restoration,
+) -> Images:
+    """Image photographs at rest side by side, each at a depth of its own, and restore them at once.
+
+    Light of one that falls on its neighbour is left out.
+
+    Args:
+        camera: to be shown; the others as of `images_of`.
+        photographs: one for each depth, (D, 3, S, S).
+    """
+    told = _cut(wave_functions(camera, scene))
+    readout = _readout(camera, light, read_noise)
+    still, generator = torch.zeros(len(told), 2), torch.Generator().manual_seed(0)
+    parts = [
+        _exposed(photograph, told[:, depth], still, readout, generator)
+        for depth, photograph in enumerate(photographs)
+    ]
+    stack = torch.cat(parts, dim=-1)
+    found = network(stack, told, None, torch.tensor([readout.noise] * len(told)))
+    truth = torch.cat(list(photographs[_INNER]), dim=-1)
+    return Images(
+        linear_to_srgb(truth)[None], linear_to_srgb(stack[0].mean(0))[None], found.clamp(0.0, 1.0)
+    )
+
+
+def scene_figure(rows: Mapping[str, Images], title: str) -> Figure:
+    """Draw the truth, and below it what each camera saw and what was restored of it."""
+    figure = Figure(figsize=(PAGE, 0.62 * PAGE * (len(rows) + 1) / 3.4), layout="constrained")
+    grid = figure.subplots(len(rows) + 1, 2, squeeze=False)
+    truth = next(iter(rows.values())).truth
+    shown = [("truth", truth, truth)] + [(n, one.raw, one.restored) for n, one in rows.items()]
+    for axes, (name, raw, restored) in zip(grid, shown, strict=True):
+        for ax, kind, image in zip(axes, ("raw", "restored"), (raw, restored), strict=True):
+            ax.imshow(image[0].clamp(0.0, 1.0).permute(1, 2, 0).numpy(), interpolation="none")
+            ax.set_axis_off()
+            if image is truth:
+                ax.set_title("truth", fontsize=SMALL)
+            else:
+                psnr = float(psnr_db(image, truth))
+                ax.set_title(f"{name}, {kind}: {psnr:.1f} dB", fontsize=SMALL)
+    draw_title(figure, title)
+    return figure
+
+
+def _exposed(
+    photograph: Tensor,
+    functions: Tensor,
+    moves: Tensor,
+    readout: Readout,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return the readouts (1, N, 3, H, W) of a photograph behind functions (N, 3, K, K)."""
+    images = []
+    for move, own in zip(moves, functions, strict=True):
+        there = shifted(photograph, move) if bool(move.any()) else photograph
+        image = blurred(there[None], own)[_INNER][0].clamp(min=0.0)
+        images.append(readout.develop(readout(image, generator)))
+    return torch.stack(images)[None]
 
 
 def _readout(camera: DepthCamera, light: float, read_noise: float) -> Readout:
