@@ -47,6 +47,7 @@ from scripts.coding.judged import (
     scene_figure,
     scene_of,
     scenes_of,
+    scikit_image_scenes,
     scores_of,
 )
 
@@ -142,7 +143,7 @@ def judge(
 
 
 def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], file: Path) -> int:
-    """Write the figure of three photographs side by side, at the three depths of the first range.
+    """Write the figure of scikit-image's three test photographs side by side, at three depths.
 
     Raises:
         InputError: no file is given.
@@ -150,10 +151,8 @@ def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], f
     if file is None:
         raise InputError("scene: --figure FILE is missing")
     name, scene = next(iter(RANGES.items()))
-    validation, test = (scenes_of([str(f) for f in folders], split) for split in ("val", "test"))
-    # Those of most detail.
-    detail = test.diff(dim=-1).abs().mean((1, 2, 3))
-    photographs = test[detail.argsort(descending=True)[: len(scene.depths)]]
+    validation = scenes_of([str(f) for f in folders], "val")
+    photographs = scikit_image_scenes()[: len(scene.depths)]
     restorer = "by depth"
     judges = (scene, light, restorer, validation)
     stops = [chosen(f"plain F/{n:g}", scene, light, True)[0] for n in F_NUMBERS]
@@ -161,7 +160,7 @@ def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], f
     cameras = [plain, *(chosen(family, scene, light, True)[0] for family in families)]
     network = restorer_of(restorer)
     rows = {
-        f"{c.family}, F/{c.f_number:g}": scene_of(
+        c.family if c is plain else f"{c.family}, F/{c.f_number:g}": scene_of(
             c, scene, light, _READ_NOISE, photographs, network
         )
         for c in cameras

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.experiments.data.package_photographs import PackagePhotographsDataModule
+from dolens.experiments.data.photos import PhotosDataModule
 from dolens.experiments.pretraining.examples import blurred
 from dolens.plotting.style import PAGE, SMALL
 from dolens.plotting.titles import draw_title
@@ -59,6 +60,17 @@ def scenes_of(folders: Sequence[str], split: str, limit: int | None = None) -> T
     if limit is None:
         return found
     return found[torch.linspace(0, len(found) - 1, min(limit, len(found))).round().long()]
+
+
+def scikit_image_scenes() -> Tensor:
+    """Return the middles of the three test photographs of `data=photos`, as `scenes_of`."""
+    data = PhotosDataModule(
+        crop_size=SIDE,
+        margin=MARGIN,
+        evaluation_crops_per_photograph=1,
+        evaluation_scale=1.0,
+    )
+    return torch.cat(list(data.test_dataloader()))
 
 
 def restorer_of(name: str) -> Restoration:
