@@ -200,7 +200,9 @@ def test_gains_of_depth_of_field_are_over_the_plain_lens_of_their_condition():
     text = (ROOT / "docs/results/phase_plate.md").read_text(encoding="utf-8")
     plain, checked = None, 0
     for line in re.findall(r"^\| \d+ \| (?:blind|by depth) \|.*$", text, re.M):
-        light, restorer, camera, _, depths, *gains = (c.strip() for c in line.strip("| ").split("|"))
+        light, restorer, camera, _, depths, *gains = (
+            c.strip() for c in line.strip("| ").split("|")
+        )
         scores = [float(value) for value in depths.split("/")]
         if camera.startswith("plain"):
             plain = (light, restorer), scores

@@ -57,6 +57,8 @@ class Evaluation:
             filtered = camera.filtered(taken, functions) if stage == "test" else None
             if filtered is not None:
                 row["linear_psnr_db"] = _compared(psnr_db, filtered.clamp(0.0, 1.0), taken.truth)
+            if stage == "test":
+                row |= _of_plain_exposure(camera, values, batch, index, reference)
             if stage == "test" and reference is None:
                 row |= _of_rivals(camera, taken, functions, values)
             self._add(name, index, row)
@@ -121,6 +123,9 @@ class Evaluation:
                 ]
         if hasattr(camera.network, "filtered"):
             found += [f"test{judge}/linear_psnr_db{view}" for judge in judges for view in views]
+        if camera.views.has_plain_exposure:
+            plain = [f"plain_{score}" for score in ("psnr_db", "ssim")]
+            found += [f"test{j}/{name}{view}" for j in judges for name in plain for view in views]
         names = rival_names(camera.views.sensor)
         rivals = [f"{name}_{score}" for name in names for score in ("psnr_db", "ssim")]
         found += [f"test/{name}{view}" for name in rivals for view in views]
@@ -192,6 +197,24 @@ def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
         loss = camera.loss_over_views(restored, truth.to(restored.dtype))
         row = {"loss": loss["total"].expand(truth.shape[:2])}
         return row | _scored({"": restored, "raw_": linear_to_srgb(taken.raw)}, truth)
+
+
+def _of_plain_exposure(
+    camera: Camera,
+    values: Mapping[str, Tensor],
+    batch: Tensor,
+    index: int,
+    reference: str | None,
+) -> dict[str, Tensor]:
+    """Return scores (B, V) of what the network restores of a plain lens's images, if any."""
+    with camera.exact():
+        found = camera.views.plain_exposure(camera.lens, values, batch, "test", index, reference)
+    if found is None:
+        return {}
+    taken, functions, noise = found
+    arguments = camera.network.noise_arguments(noise)
+    restored = camera.network(taken.given, functions, None, *arguments).clamp(0.0, 1.0)
+    return _scored({"plain_": restored.unflatten(0, taken.raw.shape[:2])}, taken.truth)
 
 
 def _of_rivals(

@@ -17,6 +17,7 @@ from dolens.reconstruction.intervals import Interval, gain_interval
 OVER = {
     "gain_over_filter_db": ("linear_psnr_db", "the network's own linear filter"),
     "gain_over_raw_db": ("raw_psnr_db", "the sensor's image"),
+    "gain_over_plain_db": ("plain_psnr_db", "the plain lens in one exposure, restored alike"),
     **{f"gain_over_{name}_db": (f"{name}_psnr_db", said) for name, said in RIVALS.items()},
 }
 

@@ -134,7 +134,7 @@ def test_known_motion_is_in_the_functions_that_restorers_are_told(camera):
         return float((seen - found.readouts[0, depth, state]).abs()[:, 4:-4, 4:-4].max())
 
     for state, depth in ((0, 0), (0, 2), (2, 0), (2, 2)):
-        assert error(functions, state, depth) < 0.008 < 0.03 < error(still, state, depth)
+        assert error(functions, state, depth) < 0.008 < 0.025 < error(still, state, depth)
 
 
 def test_motion_is_estimated_of_each_image_by_itself(camera):
@@ -197,6 +197,8 @@ def test_a_bracket_trains_and_is_judged_beside_untrained_restorers(composed, tmp
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["test/psnr_db/worst"] > metrics["test/raw_psnr_db/worst"]
     assert "test/tv_psnr_db/worst" in metrics
+    gain = metrics["test/gain_over_plain_db"]
+    assert gain == pytest.approx(metrics["test/psnr_db"] - metrics["test/plain_psnr_db"], abs=1e-3)
     foci = [metrics[f"variables/states.{name}.sensor_distance"] for name in ("far", "near")]
     assert foci != [95.5, 96.25]
     assert {"images", "point_spread_functions", "layout"} <= figure_names(tmp_path / "run")
@@ -214,12 +216,34 @@ def test_a_bracket_is_applied_to_whole_pictures_at_rest(root, tmp_path):
         apply_run(folder, [picture], Options(raw=True))
 
 
+def test_the_plain_lens_beside_has_all_the_light_that_its_stop_passes(camera):
+    module = camera("light=1000")
+    arguments = (module.lens, module.variables(), texture(), "test", 0)
+    with torch.no_grad():
+        found = module.views.plain_exposure(*arguments)
+    # At F/16 a quarter of F/8's, and all the time: 4/3 of the share's noise of a third.
+    shot, read = module.views.noise[0]
+    assert found.noise == pytest.approx((4.0 * shot / 3.0, 16.0 * read / 9.0), rel=0.02)
+    alone = camera(
+        "exposures=null",
+        "variables=null",
+        "network.held=false",
+        "light=1000",
+        "lens.sensor.distance=95.82",
+        "lens.surfaces.1.semi_diameter=3.175",
+    )
+    one, _ = taken(alone, texture())
+    torch.testing.assert_close(found.taken.raw, one.raw)
+    assert list(module.views.shares) == ["far", "middle", "near"]
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (("~lens.states.far", "~lens.states.near"), "exposures: .*has 1 states; needed: two"),
         (("exposures.shares=[0.5,0.5]",), "exposures.shares: 2 of 3 states"),
         (("exposures.shares=[0.5,0.5,0.5]",), "exposures.shares: their sum is 1.5"),
+        (("exposures.beside=side",), "has no state 'side'"),
         (("exposures.motion=9",), "exposures.motion: 9"),
         (("exposures.motion_is=guessed",), "exposures.motion_is"),
         (("exposures.readouts=one",), "exposures.motion_is: estimated; allowed with one readout"),

@@ -51,6 +51,20 @@ class Views(NamedTuple):
         return (self.raw if self.readouts is None else self.readouts).flatten(0, 1)
 
 
+class PlainExposure(NamedTuple):
+    """Images by a simpler camera of the same scene, and what restorers are told of them.
+
+    Attributes:
+        taken: the images.
+        functions: point spread functions.
+        noise: as of `Readout.noise`.
+    """
+
+    taken: Views
+    functions: Tensor
+    noise: Sequence[float]
+
+
 class Comparison(NamedTuple):
     """The training's own loss and variables, for judging gradients.
 
@@ -300,6 +314,23 @@ class Imaging(ABC):
         readout = readout or self.readout
         generator = generator_of(seed + _NOISE_OFFSET, image.device)
         return readout.develop(readout(image, generator, share))
+
+    def plain_exposure(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        reference: str | None = None,
+    ) -> PlainExposure | None:
+        """Return images by a plain lens in one exposure, to compare; None where there is none."""
+        return None
+
+    @property
+    def has_plain_exposure(self) -> bool:
+        """Whether there is a plain lens to compare with."""
+        return False
 
     def sensed(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """Return what the sensor gives for light (1, 3, H, W): (1, C, H, W), or of each of N

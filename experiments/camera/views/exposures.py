@@ -11,11 +11,17 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
-from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.base import (
+    Comparison,
+    Imaging,
+    PlainExposure,
+    Views,
+    seed_of,
+)
 from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.experiments.checks import check_positive
 from dolens.optics.lens import Lens
-from dolens.optics.lens_states import values_there
+from dolens.optics.lens_states import check_state, values_there
 from dolens.reconstruction.motion import estimated_motion
 from dolens.reconstruction.readouts import shifted
 from dolens.seeded_generators import generator_of
@@ -43,6 +49,8 @@ class Exposures:
         motion: of the scene from one readout to the next, pixels, straight on in a direction that
             is drawn for each batch.  The middle one is the truth.  The scene rests during each.
         motion_is: what restorers know of it: `known`, `estimated` from the readouts, or `ignored`.
+        beside: a state that takes no part: the plain lens in one exposure of all the time, at its
+            own F-number, which tests compare with.  None: nothing.
 
     Raises:
         InputError: a number out of range, or an unknown word.
@@ -52,6 +60,7 @@ class Exposures:
     readouts: str = "each"
     motion: float = 0.0
     motion_is: str = "known"
+    beside: str | None = None
 
     def __post_init__(self) -> None:
         for number, share in enumerate(self.shares or ()):
@@ -75,7 +84,9 @@ class Exposures:
         Raises:
             InputError: the lens has fewer than two states, or the shares are not as many.
         """
-        names = lens.state_names
+        if self.beside is not None:
+            check_state(lens, self.beside)
+        names = [name for name in lens.state_names if name != self.beside]
         if len(names) < 2:
             raise InputError(
                 f"exposures: lens '{lens.name}' has {len(names)} states; needed: two at least, as "
@@ -112,6 +123,7 @@ class ExposedViews(Imaging):
         for part in self.parts.values():
             part.readout = Readout()  # light, which is read out here
         self.evaluation_renderer = views.evaluation_renderer
+        self._plain = copy.copy(views)
         self.view_is_known = views.view_is_known  # type: ignore[misc]
         self.psf_place = views.psf_place  # type: ignore[misc]
         self._several = settings.readouts == "each"
@@ -266,6 +278,29 @@ class ExposedViews(Imaging):
         weighted = [s * one for s, one in zip(self.shares.values(), states, strict=True)]
         return torch.stack(weighted).sum(dim=0)
 
+    @property
+    def has_plain_exposure(self) -> bool:
+        """Whether there is a plain lens to compare with."""
+        return self.settings.beside is not None and not self.view_is_known
+
+    def plain_exposure(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        reference: str | None = None,
+    ) -> PlainExposure | None:
+        """Return images of the scene at rest by the state `beside`."""
+        if not self.has_plain_exposure:
+            return None
+        name = self.settings.beside
+        state = (lens.in_state(name), values_there(lens, name, values))
+        taken = self._plain.take(*state, textures, stage, index, reference)
+        functions = self._plain.point_spread_functions(*state)
+        return PlainExposure(taken, functions, self._plain.readout.noise)
+
     def whole_picture(
         self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
     ) -> WholePicture:
@@ -324,12 +359,15 @@ class ExposedViews(Imaging):
         super().check(lens)
         for name, part in self.parts.items():
             part.check(lens.in_state(name))
+        self._plain.check(lens.in_state(self.settings.beside))
 
     def expose(self, lens: Lens) -> None:
         """Set the exposure by the aperture of the lens, as `Imaging.expose`."""
         super().expose(lens)
         for name, part in self.parts.items():
             part.expose(lens.in_state(name))
+        if self.settings.beside is not None:
+            self._plain.expose(lens.in_state(self.settings.beside))
 
     def prepare(
         self,
