@@ -238,8 +238,11 @@ class CameraModule(Camera):
             self.on_train_epoch_start()
         self.costs.start()
 
-    def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
-        """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
+    def training_step(self, batch: Tensor, batch_idx: int) -> Tensor | None:
+        """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light.
+
+        Where the network is held and the lens stands still, nothing is to move: None.
+        """
         with self.costs.making_images():
             values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
             taken, functions = training_images(self, self.manufacture, values, batch, share)
@@ -270,7 +273,7 @@ class CameraModule(Camera):
             term, numbers = self.adversary(truth.flatten(0, 1), restored.flatten(0, 1))
             self.log_dict({f"train/{name}": value for name, value in numbers.items()})
             total = total + term
-        return total
+        return total if total.requires_grad else None
 
     def optimizer_step(
         self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None

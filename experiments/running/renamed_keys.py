@@ -62,7 +62,10 @@ RENAMED = Renamed(
         Key("module.simulation_arms", "module.simulation_pupil.arms"),
     ),
     options={
-        "experiment": {"pose_knowledge": "pose_bounds"},
+        "experiment": {
+            "large_fov_doublet_initial": "large_fov_doublet_refocused",
+            "pose_knowledge": "pose_bounds",
+        },
         # One callback saves the figures of every experiment.
         "callbacks": dict.fromkeys(
             ("alignment", "pose_accuracy", "pose_knowledge", "speed", "tolerances"), "figures"

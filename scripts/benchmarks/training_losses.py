@@ -26,6 +26,7 @@ _EXPERIMENTS = {
         "renderer.sensor.height=48",
         "renderer.sensor.width=48",
         "renderer.sensor.pixel_pitch=0.03",
+        "network=field_pyramid",
         "network.weights=none",
     ),
 }

@@ -101,13 +101,11 @@ CASES: Mapping[str, Case] = {
     "doublet of Table III, field": Case(
         (
             "experiment=large_fov_doublet",
-            "renderer=psf_window",
+            "~variables.sensor_distance",
             "renderer.fields=[1,1]",
             "renderer.sensor={height: 64, width: 64}",
-            "evaluation_renderer=psf",
             "evaluation_renderer.fields=[1,1]",
             "psf_size=33",
-            "data.margin=16",
             *_FIELDS,
         ),
         0.06,

@@ -31,20 +31,14 @@ from tests.experiments.tiny_experiment import TINY_DOUBLET
 ZONE = {"0.5": 0.5}
 # Blur of some four pixels, whole in its window; test images as sharp in noise as functions are.
 COARSE = (
-    *(o for o in TINY_DOUBLET if not o.startswith("evaluation_renderer.")),
+    *(o for o in TINY_DOUBLET if not o.startswith("evaluation_renderer")),
     "views.sensor={height: 400, width: 400, pixel_pitch: 0.08}",
-    "renderer=psf_window",
-    "renderer.size=21",
-    "evaluation_renderer=psf",
-    "evaluation_renderer.size=21",
+    "psf_size=21",
     "renderer.sensor.height=48",
     "renderer.sensor.width=48",
     "data.margin=24",
 )
-GENERAL = (
-    *(o for o in COARSE if not o.startswith("network.")),
-    "network=general",
-)
+GENERAL = (*(o for o in COARSE if not o.startswith("network")),)
 
 
 def views_of(size, truth):

@@ -139,6 +139,22 @@ def test_a_lens_that_is_designed_first_is_better_for_linear_filters(composed, tm
     assert after < 0.95 * before
 
 
+def test_a_lens_that_is_designed_first_alone_needs_no_network_to_train(composed, tmp_path):
+    """Behind a network that is held nothing moves in the steps that follow."""
+    held = [o for o in TINY_DOUBLET if not o.startswith("network")]
+    ends = []
+    for steps in (1, 3):
+        short = [f"data.steps_per_epoch={steps}", "trainer.max_epochs=1", "test=false"]
+        objective = "objective=lens_first/deconvolved_error"
+        run(composed(*held, *FIXED_WINDOWS, *FIRST, "optimizer.until=0.0", *short, objective))
+        ends.append(json.loads((tmp_path / "run/metrics.json").read_text()))
+    first, begun = (ends[0][f"lens_first/deconvolved_error{e}"] for e in ("", "_before"))
+    assert first < 0.9 * begun
+    for name, value in ends[0].items():
+        if name.startswith("variables/"):
+            assert ends[1][name] == value
+
+
 def test_a_lens_stands_still_after_its_share_of_the_steps(composed, tmp_path):
     """Adam moves it in the first two of four steps, as if they had been all."""
     common = [*TINY_DOUBLET, *FIXED_WINDOWS, "optimizer.lens=adam", "scheduler.T_max=100"]

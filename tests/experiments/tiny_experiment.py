@@ -28,6 +28,9 @@ TINY_DOUBLET = [
     "experiment=large_fov_doublet",
     "renderer.sensor.height=32",
     "renderer.sensor.width=32",
+    "variables.sensor_distance.initial=45.0",  # out of focus, as published
+    "psf_size=15",
+    "evaluation_renderer=rays",
     "evaluation_renderer.pupil_samples=2",
     "data.margin=12",
     "data.steps_per_epoch=2",
@@ -37,11 +40,12 @@ TINY_DOUBLET = [
     "+trainer.limit_test_batches=1",
     "+trainer.enable_progress_bar=false",
     "trainer.log_every_n_steps=1",
+    "network=field_pyramid",
     "network.width_multiplier=0.25",
     "network.weights=none",
     "loss.perceptual=none",
 ]
-FIXED_WINDOWS = ["renderer=psf_window", "renderer.fields=[1,1]", "renderer.size=15"]
+FIXED_WINDOWS = ["renderer.fields=[1,1]"]
 
 
 def figure_names(folder: Path) -> set[str]:
