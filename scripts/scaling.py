@@ -42,7 +42,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Renderers that need no plan, which would take longer than the steps.
 EXPERIMENTS = {
     "wavefront_coding": ["renderer=psf", "reference_renderers=none", "miscalibrations=none"],
-    "large_fov_doublet": [],
+    "large_fov_doublet": ["network=field_pyramid", "optimizer.lens=adam"],
 }
 _STEPS = 12
 # Steps before the medians begin: kernels are loaded, and memory is fetched.

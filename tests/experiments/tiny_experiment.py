@@ -40,6 +40,7 @@ TINY_DOUBLET = [
     "+trainer.limit_test_batches=1",
     "+trainer.enable_progress_bar=false",
     "trainer.log_every_n_steps=1",
+    "optimizer.lens=adam",
     "network=field_pyramid",
     "network.width_multiplier=0.25",
     "network.weights=none",
