@@ -166,6 +166,10 @@ def number(cell):
     return Decimal(found[0].replace("−", "-")) if found else None
 
 
+# Names of the columns of what a column of gains is of.
+VALUES = ("packages", "worst tenth", "anywhere")
+
+
 def printed_gains():
     """Every gain in dB of the documents' tables: where it stands, it, and its two numbers."""
     for row in next(rows for rows in tables(ROOT / "README.md") if "system" in rows[0][0]):
@@ -190,7 +194,7 @@ def printed_gains():
                 # In a column: over the row of the same conditions that has none.
                 gain = head.index("gain")
                 alike = [head.index(k) for k in ("seconds", "seeds", "tolerances") if k in head]
-                value = head.index("packages" if "packages" in head else "worst tenth")
+                value = next(head.index(k) for k in VALUES if k in head)
                 (over,) = (r for r in rows if not r[gain] and all(r[i] == row[i] for i in alike))
                 yield where, number(row[gain]), number(row[value]), number(over[value])
 
