@@ -153,6 +153,9 @@ def _metres(distance: float) -> str:
 
 def _label(label: str) -> str:
     """Return `8 m` for the label `8m` of a depth, and `0.7 of the field` for that of a zone."""
+    state, _, own = label.rpartition(", ")
+    if state:  # of a lens that is exposed in several
+        return f"{state}, {_label(own)}"
     number = label.removesuffix("m")
     if number.replace(".", "").isdigit():
         return f"{number} m" if number != label else f"{label} of the field"
