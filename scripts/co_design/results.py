@@ -63,3 +63,51 @@ def summary(by_case: Mapping[str, Sequence[float]]) -> str:
         f"Least squares win {sum(g > 0.0 for g in every)} of {len(every)}, median "
         f"{statistics.median(every):+.2f} dB [{low:+.2f}, {high:+.2f}] over co-designs and seeds."
     )
+
+
+def against(runs: Sequence[Mapping[str, object]], theirs: str) -> list[str]:
+    """Return lines of Markdown: every method's mean score by co-design, and what the best of the
+    others wins over one by seed.
+
+    Only co-designs and seeds that every method has are counted.
+
+    Args:
+        runs: with `case`, `optimizer`, `seed`, `score` and `seconds`.
+        theirs: the method that the others are compared with.
+    """
+    scores = {(str(r["case"]), str(r["seed"]), str(r["optimizer"])): r for r in runs}
+    methods = list(dict.fromkeys(sorted(key[2] for key in scores)))
+    ours = [method for method in methods if method != theirs]
+    whole = [
+        key
+        for key in dict.fromkeys(key[:2] for key in scores)
+        if all((*key, method) in scores for method in methods)
+    ]
+
+    def score(key: tuple[str, str], method: str) -> float:
+        return float(str(scores[(*key, method)]["score"]))
+
+    lines = [
+        f"| co-design | {theirs}, dB | {', dB | '.join(ours)}, dB | best of ours, by seed, dB |",
+        "|" + "---|" * (len(methods) + 2),
+    ]
+    won: list[float] = []
+    for case in dict.fromkeys(case for case, _ in whole):
+        keys = [key for key in whole if key[0] == case]
+        found = [max(score(key, m) for m in ours) - score(key, theirs) for key in keys]
+        won += found
+        means = [statistics.fmean(score(key, m) for key in keys) for m in (theirs, *ours)]
+        lines.append(
+            f"| {case} | {' | '.join(f'{m:.2f}' for m in means)} | "
+            f"{', '.join(f'{g:+.2f}' for g in found)} |"
+        )
+    singles = []
+    for method in ours:
+        gained = [score(key, method) - score(key, theirs) for key in whole]
+        singles.append(f"{method} {sum(g >= 0.0 for g in gained)}")
+    return [
+        *lines,
+        "",
+        f"The best of ours is at least as good in {sum(g >= 0.0 for g in won)} of {len(won)}, by "
+        f"{statistics.median(won):+.2f} dB in the median; each alone: {', '.join(singles)}.",
+    ]

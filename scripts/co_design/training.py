@@ -3,7 +3,7 @@
 import logging
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import lightning
@@ -15,6 +15,8 @@ from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import build_lens
 from scripts.composed import composed
+
+CallbacksOf = Callable[[], list[lightning.Callback]]
 
 # Steps of two short trainings, whose difference tells what a step costs.
 _SHORT, _LONG = 5, 20
@@ -35,21 +37,24 @@ class Trainings:
         self._data, self._seconds = tuple(data), seconds
         self._step_costs: dict[tuple[str, ...], float] = {}
 
-    def scores(self, overrides: Sequence[str], seed: int, split: str) -> dict[str, float]:
+    def scores(
+        self, overrides: Sequence[str], seed: int, split: str, callbacks: CallbacksOf = list
+    ) -> dict[str, float]:
         """Train, and return scores with what it cost.
 
         Args:
             overrides: of `train.py`.
             seed: of the run.
             split: `val` or `test`.
+            callbacks: makes those of a training, which may move the lens in dolens's place.
         """
         module, _, _ = self._made([*overrides, *_steps(1)], seed)
         begun = time.process_time()
         module.lens_steps.begin(module.network.needs_point_spread_function, module.view_norm)
         left = self._seconds - (time.process_time() - begun)
-        steps = max(1, round(left / self._step_cost(list(overrides))))
+        steps = max(1, round(left / self._step_cost(list(overrides), callbacks)))
         module, data, score = self._made([*overrides, *_steps(steps)], seed)
-        seconds = _fit(module, data, steps)
+        seconds = _fit(module, data, steps, callbacks())
         trainer = _trainer(steps)
         if split == "val":
             trainer.validate(module, data, verbose=False)
@@ -65,20 +70,19 @@ class Trainings:
             "seconds": seconds,
         }
 
-    def _step_cost(self, overrides: list[str]) -> float:
+    def _step_cost(self, overrides: list[str], callbacks: CallbacksOf) -> float:
         """Return process seconds of a step; a lens that stands still after a share costs less."""
         until = [o for o in overrides if o.startswith("optimizer.until=")]
         share = float(until[0].split("=")[1]) if until else 1.0
-        others = [
-            o
-            for o in overrides
-            if not o.startswith(("optimizer.until", "optimizer.least_squares", "learning_rates"))
-        ]
-        moving, still = (self._measured(others, moves) for moves in ("1.0", "0.0"))
+        # What a design before the first step costs is known apart.
+        dropped = ["optimizer.until", "learning_rates"]
+        dropped += [] if callbacks() else ["optimizer.least_squares"]
+        others = [o for o in overrides if not o.startswith(tuple(dropped))]
+        moving, still = (self._measured(others, moves, callbacks) for moves in ("1.0", "0.0"))
         return share * moving + (1.0 - share) * still
 
-    def _measured(self, overrides: list[str], until: str) -> float:
-        key = (*overrides, until)
+    def _measured(self, overrides: list[str], until: str, callbacks: CallbacksOf) -> float:
+        key = (*overrides, until, *(type(callback).__name__ for callback in callbacks()))
         if key not in self._step_costs:
             whole = [*overrides, f"optimizer.until={until}"]
             costs = []
@@ -86,7 +90,7 @@ class Trainings:
                 times = []
                 for steps in (_SHORT, _LONG):
                     module, data, _ = self._made([*whole, *_steps(steps)], 0)
-                    times.append(_fit(module, data, steps))
+                    times.append(_fit(module, data, steps, callbacks()))
                 costs.append((times[1] - times[0]) / (_LONG - _SHORT))
             self._step_costs[key] = min(costs)
         return self._step_costs[key]
@@ -104,8 +108,9 @@ def _steps(count: int) -> tuple[str, str]:
     return f"data.steps_per_epoch={count}", "trainer.max_epochs=1"
 
 
-def _trainer(steps: int) -> lightning.Trainer:
+def _trainer(steps: int, callbacks: Sequence[lightning.Callback] = ()) -> lightning.Trainer:
     return lightning.Trainer(
+        callbacks=list(callbacks),
         accelerator="cpu",
         max_epochs=1,
         logger=False,
@@ -117,9 +122,11 @@ def _trainer(steps: int) -> lightning.Trainer:
     )
 
 
-def _fit(module: CameraModule, data: Any, steps: int) -> float:
+def _fit(
+    module: CameraModule, data: Any, steps: int, callbacks: Sequence[lightning.Callback]
+) -> float:
     """Train, without validation, and return the process seconds."""
-    trainer = _trainer(steps)
+    trainer = _trainer(steps, callbacks)
     trainer.limit_val_batches = 0
     begun = time.process_time()
     trainer.fit(module, data)
