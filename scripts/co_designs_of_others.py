@@ -26,7 +26,12 @@ _PHOTOGRAPHS = ("data=package_photographs", "data.evaluation_crops_per_photograp
 
 
 def run(
-    folder: Path, names: Sequence[str], seconds: float, seeds: Sequence[int], data: Sequence[str]
+    folder: Path,
+    names: Sequence[str],
+    methods: Sequence[str],
+    seconds: float,
+    seeds: Sequence[int],
+    data: Sequence[str],
 ) -> None:
     """Train and judge what has no file yet; a line each."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -34,7 +39,8 @@ def run(
     for seed in seeds:
         for name in names:
             case = CASES[name]
-            for method, how in METHODS.items():
+            for method in methods:
+                how = METHODS[method]
                 file = folder / f"{name}_{method}_seed_{seed}.json".replace(", ", "_").replace(
                     " ", "_"
                 )
@@ -53,6 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("what", choices=("run", "show"))
     parser.add_argument("--folder", type=Path, default=Path("outputs/of_others"))
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--seconds", type=float, default=12.0, help="process time of a training")
     parser.add_argument("--seeds", nargs="*", type=int, default=[1, 2, 3])
     parser.add_argument("--package-folders", nargs="*", default=[], help="of unpacked photographs")
@@ -61,7 +68,7 @@ def main(arguments: Sequence[str]) -> int:
         if given.what == "run":
             folders = [f"data.folders=[{','.join(given.package_folders)}]"]
             data = [*_PHOTOGRAPHS, *(folders if given.package_folders else [])]
-            run(given.folder, given.cases, given.seconds, given.seeds, data)
+            run(given.folder, given.cases, given.methods, given.seconds, given.seeds, data)
         else:
             files = sorted(given.folder.glob("*_seed_*.json"))
             print("\n".join(against([json.loads(f.read_text()) for f in files], THEIRS)))

@@ -1,5 +1,6 @@
 """Designs of others are read as meant, from a file of a closed form that the test writes."""
 
+import itertools
 import math
 from pathlib import Path
 
@@ -125,10 +126,48 @@ def test_a_field_stop_leaves_the_upper_part_of_a_pupil(tmp_path):
     assert float(rays.light[4]) == pytest.approx(share)
 
 
+def metasurface(row: list[float], bezier: bool) -> dict:
+    model = {"normalization_radius": 4.0, "bezier_parameterization": bezier}
+    return {
+        "lens_sequence": "s-m-",
+        "c": [],
+        "a": [],
+        "m": [row],
+        "nd": [],
+        "vd": [],
+        "s": [1.0, 50.0],
+        "solve_idx": None,
+        "misc_surface_model": {
+            "class_path": "x.DispersionEngineeredMetasurface",
+            "init_args": model,
+        },
+    }
+
+
+@pytest.mark.parametrize("bezier", [False, True])
+def test_a_metasurface_focuses_by_its_quadratic_phase(tmp_path, bezier):
+    """A phase -π r²/(λf) has the focal length f; Bernstein's polynomials sum to one."""
+    strength = -math.pi * 4.0**2 / (550e-6 * 50.0)
+    row = [strength, strength if bezier else 0.0, 0.0, 0.0]
+    design = read_design(written(tmp_path, metasurface(row, bezier)))
+    terms, radius = design.surfaces[1].phase
+    assert radius == 4.0
+    assert terms == pytest.approx((strength, 0.0))
+    assert float(lens_of(design).first_order(550.0).efl) == pytest.approx(50.0)
+
+
+def test_a_metasurface_whose_phase_goes_with_wavelength_is_refused(tmp_path):
+    with pytest.raises(InputError, match="goes with 1/λ"):
+        read_design(written(tmp_path, metasurface([-1.0, 0.0, 3.0, 0.0], False)))
+
+
 @pytest.mark.parametrize(
     ("lens", "message"),
     [
-        ({"lens_sequence": "s-m-aRa-"}, "metasurface"),
+        (
+            {"lens_sequence": "s-m-aRa-", "s": [1.0, 1.0, 2.0, 27.0]},
+            "m: 0; allowed for s-m-aRa-: 1",
+        ),
         ({"lens_sequence": "s-d-aRa-"}, "diffractive"),
         ({"lens_sequence": "s-aRa-R-"}, "c: 2; allowed for s-aRa-R-: 4"),
         ({"lens_sequence": "aRa-"}, "0 stops"),
@@ -167,14 +206,15 @@ def test_a_redesign_sharpens_a_singlet_within_its_limits(tmp_path, rule):
     design = read_design(written(tmp_path))
     lens = lens_of(design)
     published = measures(lens, design)
-    theirs = {"lm_parameter": 1.0, "tolerance": 1.0}
+    theirs, ticks = {"lm_parameter": 1.0, "tolerance": 1.0}, itertools.count()
     made = redesigned(
         lens,
         design,
         published,
-        1.0,
+        40.0,
         least_squares if rule == "dolens" else lambda v: their_rule(v, theirs),
         rounds=2,
+        clock=lambda: float(next(ticks)),
     )
     assert made.broken == []
     assert made.measures.mean < 0.9 * published.mean

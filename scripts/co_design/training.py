@@ -20,6 +20,8 @@ CallbacksOf = Callable[[], list[lightning.Callback]]
 
 # Steps of two short trainings, whose difference tells what a step costs.
 _SHORT, _LONG = 5, 20
+# How often they are made, for the faster one.
+_REPEATS = 2
 
 
 class Trainings:
@@ -78,15 +80,17 @@ class Trainings:
         dropped = ["optimizer.until", "learning_rates"]
         dropped += [] if callbacks() else ["optimizer.least_squares"]
         others = [o for o in overrides if not o.startswith(tuple(dropped))]
-        moving, still = (self._measured(others, moves, callbacks) for moves in ("1.0", "0.0"))
-        return share * moving + (1.0 - share) * still
+        parts = {"1.0": share, "0.0": 1.0 - share}
+        return sum(
+            part * self._measured(others, moves, callbacks) for moves, part in parts.items() if part
+        )
 
     def _measured(self, overrides: list[str], until: str, callbacks: CallbacksOf) -> float:
         key = (*overrides, until, *(type(callback).__name__ for callback in callbacks()))
         if key not in self._step_costs:
             whole = [*overrides, f"optimizer.until={until}"]
             costs = []
-            for _ in range(2):
+            for _ in range(_REPEATS):
                 times = []
                 for steps in (_SHORT, _LONG):
                     module, data, _ = self._made([*whole, *_steps(steps)], 0)

@@ -2,10 +2,12 @@
 
 A folder has a folder for each specification, with `defaults.yml` and `designs/*.yml`; a design's
 settings go before the defaults'.  A lens is a word: `s` is the stop, `R` an element, `a` in front
-of one and behind it a surface with aspheric terms, `-` an air space; so is `s-aRa-R-` a stop, an
-air space, an element of two aspheres, an air space, an element of two spheres, and the back focus.
-`c` are curvatures, `s` the spaces in the order of the word, `nd`, `vd` and `dpgf` glasses, and each
-row of `a` is a conic constant and the coefficients of r⁴, r⁶, ...  Lengths are in mm.
+of one and behind it a surface with aspheric terms, `m` a metasurface, `-` an air space.  So is
+`s-aRa-R-` a stop, an air space, an element of two aspheres, an air space, an element of two
+spheres, and the back focus.  `c` are curvatures, `s` the spaces in the order of the word, `nd`,
+`vd` and `dpgf` glasses, and each row of `a` is a conic constant and the coefficients of r⁴, r⁶, ...
+Each row of `m` is a phase, (r/R)² times Bernstein's polynomials of it or its powers, and one that
+goes with 1/λ.  Lengths are in mm.
 """
 
 import math
@@ -18,11 +20,8 @@ import yaml
 
 from dolens.errors import InputError
 
-_NOT_HELD = {
-    "m": "a metasurface that is engineered in dispersion: its phase is a polynomial in 1/λ",
-    "d": "a diffractive surface: this reader has none",
-}
-_CONIC_AND_TERMS = 2
+_NOT_HELD = {"d": "a diffractive surface, of which this reader knows nothing"}
+_METASURFACE = "DispersionEngineeredMetasurface"
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,7 @@ class Surface:
         glass: number of the glass behind; None for air.
         refracting: number among the curvatures of the file.
         spaced: number of the space behind among those of the file; None for none.
+        phase: of a plane metasurface, radians of (r/R)², (r/R)⁴, ..., and R, mm; None for none.
     """
 
     curvature: float | None
@@ -61,6 +61,7 @@ class Surface:
     glass: int | None
     refracting: int | None
     spaced: int | None
+    phase: tuple[tuple[float, ...], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -186,17 +187,19 @@ def _surfaces(
     for letter in word:
         if letter in _NOT_HELD:
             raise InputError(f"{name}: {_NOT_HELD[letter]} ('{letter}' in {word})")
-        if letter not in "sRa-":
-            raise InputError(f"{name}: lens_sequence: {letter!r}; allowed: s, R, a, -")
+        if letter not in "sRam-":
+            raise InputError(f"{name}: lens_sequence: {letter!r}; allowed: s, R, a, m, -")
     if word.count("s") != 1:
         raise InputError(f"{name}: lens_sequence: {word.count('s')} stops; allowed: one")
-    numbers = {key: list(lens.get(key) or []) for key in ("c", "s", "a", "nd", "vd", "dpgf")}
+    keys = ("c", "s", "a", "m", "nd", "vd", "dpgf")
+    numbers = {key: list(lens.get(key) or []) for key in keys}
     numbers["dpgf"] = numbers["dpgf"] or [0.0] * len(numbers["nd"])
     elements = word.count("R")
     wanted = {
         "c": 2 * elements,
         "s": elements + word.count("-"),
         "a": word.count("a"),
+        "m": word.count("m"),
         "nd": elements,
         "vd": elements,
         "dpgf": elements,
@@ -205,10 +208,15 @@ def _surfaces(
         if len(numbers[key]) != count:
             raise InputError(f"{name}: {key}: {len(numbers[key])}; allowed for {word}: {count}")
     rows: list[dict[str, Any]] = []
-    element = curvature = asphere = 0
+    element = curvature = asphere = metasurface = 0
     for place, letter in enumerate(word):
         if letter == "s":
             rows.append({"curvature": None, "terms": (), "glass": None, "refracting": None})
+        elif letter == "m":
+            rows.append({"curvature": 0.0, "terms": (), "glass": None, "refracting": None})
+            model = lens.get("misc_surface_model")
+            rows[-1]["phase"] = _phase(model, numbers["m"][metasurface], name)
+            metasurface += 1
         elif letter == "R":
             for behind, side in ((element, place - 1), (None, place + 1)):
                 terms: Sequence[float] = ()
@@ -233,13 +241,38 @@ def _surfaces(
     return surfaces, tuple((float(n), float(v), float(d)) for n, v, d in glasses)
 
 
+def _phase(model: Any, row: Sequence[float], name: str) -> tuple[tuple[float, ...], float]:
+    """Return a metasurface's phase, which must be the same at all wavelengths."""
+    kind = str(model.get("class_path", "")) if isinstance(model, Mapping) else ""
+    if kind.rpartition(".")[2] != _METASURFACE:
+        raise InputError(f"{name}: misc_surface_model: {kind!r}; allowed: {_METASURFACE}")
+    settings = _arguments(model, f"{name}: misc_surface_model")
+    half = len(row) // 2
+    numbers = [float(v) for v in row[:half]]
+    if any(row[half:]):
+        raise InputError(
+            f"{name}: a metasurface whose phase goes with 1/λ, which a phase of dolens does not"
+        )
+    if settings.get("bezier_parameterization"):
+        # x·Σ b_j·C(n, j)·x^j·(1 - x)^(n - j) in powers of x.
+        n = half - 1
+        numbers = [
+            sum(
+                (-1) ** (i - j) * math.comb(n, j) * math.comb(n - j, i - j) * numbers[j]
+                for j in range(i + 1)
+            )
+            for i in range(half)
+        ]
+    return tuple(numbers), float(settings.get("normalization_radius", 1.0))
+
+
 def _spaces(word: str) -> list[int | None]:
     """Return the number of the space behind each row; a stop on a vertex has none."""
     count, spaces = 0, list[int | None]()
     for letter in word:
         if letter == "R":
             spaces += [count, None]
-        elif letter == "s":
+        elif letter in "sm":
             spaces.append(None)
         elif letter == "-":
             if not spaces or spaces[-1] is not None:
@@ -251,7 +284,7 @@ def _spaces(word: str) -> list[int | None]:
 
 def _held(given: Any, count: int) -> set[int]:
     """Return which of so many numbers a `freeze` entry holds."""
-    if isinstance(given, Mapping):
+    if isinstance(given, Mapping) and count:
         toggled = {int(i) % count for i in given.get("toggle_row_col_list") or ()}
         every = set(range(count))
         return every - toggled if given.get("default") else toggled

@@ -42,6 +42,10 @@ def lens_of(design: Design) -> Lens:
             if surface.terms:
                 row["conic"] = surface.terms[0]
                 row |= {f"a{4 + 2 * n}": t for n, t in enumerate(surface.terms[1:])}
+        if surface.phase is not None:
+            terms, radius = surface.phase
+            named = {f"p{2 + 2 * n}": t for n, t in enumerate(terms)}
+            row |= {"type": "plane", "phase": {"type": "radial", "norm_radius": radius, **named}}
         if surface.glass is not None:
             row["material"] = f"{design.glasses[surface.glass][0]:.8g}"
         if number < len(design.surfaces):
@@ -150,7 +154,7 @@ def set_edges(lens: Lens, design: Design) -> None:
     """
     for surface, read in zip(lens.surfaces.values(), design.surfaces, strict=True):
         now = read
-        if read.curvature is not None:
+        if read.refracting is not None:
             now = replace(read, curvature=float(surface.curvature))
         surface.aperture = surface.aperture.resized(_open(now))
     hit = lens.trace(beams(lens, design, 1).rays, record=True)
@@ -163,7 +167,7 @@ def set_edges(lens: Lens, design: Design) -> None:
 
 def _first(design: Design) -> int:
     """Return the number of the first surface that refracts."""
-    return 1 + next(n for n, s in enumerate(design.surfaces) if s.curvature is not None)
+    return 1 + next(n for n, s in enumerate(design.surfaces) if s.refracting is not None)
 
 
 def pupil_of(lens: Lens, design: Design) -> float:
@@ -278,7 +282,7 @@ def operands_of(design: Design, weight: float = 1.0) -> list[dict[str, object]]:
 
     Args:
         design: whose fields and spaces they are; spaces that are held are left out.
-        weight: of lengths; a per cent of distortion weighs a hundredth of a millimetre.
+        weight: of lengths; a per cent of distortion weighs a tenth of a millimetre.
     """
     free = [
         (n, s) for n, s in enumerate(design.surfaces[:-1], 1) if s.spaced not in design.held["s"]
@@ -298,7 +302,7 @@ def operands_of(design: Design, weight: float = 1.0) -> list[dict[str, object]]:
     outer = [a for a in design.angles if a[1] > 0.0]
     chosen = {0.5, 0.75, 1.0}
     fields = [a for a in outer if any(abs(a[1] / design.half_field - c) < 0.051 for c in chosen)]
-    found += [{"kind": "distortion", "field": a, "weight": 0.01 * weight} for a in fields]
+    found += [{"kind": "distortion", "field": a, "weight": 0.1 * weight} for a in fields]
     return found
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from scripts.designs.files import Design
 from scripts.designs.lenses import Measures
 
-_WAYS = ("from_published", "from_start", "their_rule")
+WAYS = ("from_published", "from_start", "their_rule")
 # Spots that differ by less than this part are equal.
 _EQUAL = 1e-3
 
@@ -46,15 +46,15 @@ def redesign_table(found: Sequence[Mapping[str, Any]]) -> list[str]:
         "|" + "---|" * 7,
     ]
     for entry in found:
-        cells = [_cell(entry.get(way)) for way in _WAYS]
-        steps = ", ".join(str(entry[w]["steps"]) if w in entry else "–" for w in _WAYS)
+        cells = [_cell(entry.get(way)) for way in WAYS]
+        steps = ", ".join(str(entry[w]["steps"]) if w in entry else "–" for w in WAYS)
         start = f"{entry['start']:.1f} ({100.0 * entry['away']:g} %)" if "start" in entry else "–"
         lines.append(
             f"| {entry['name']} | {entry['published']:.3f} | {cells[0]} | {start} | "
             f"{cells[1]} | {cells[2]} | {steps} |"
         )
     counts = []
-    for way in _WAYS:
+    for way in WAYS:
         good = [
             e
             for e in found
