@@ -71,6 +71,8 @@ def redesign(
                 found[way] = {
                     "mean": result.measures.mean,
                     "largest": max(result.measures.spots),
+                    "incidence": result.measures.incidence,
+                    "slope": result.measures.slope,
                     "broken": result.broken,
                     "steps": result.steps,
                     "seconds": result.seconds,

@@ -33,12 +33,16 @@ class Limits:
         glass: least and largest path in an element, mm.
         back: least path from the last surface to the image, mm.
         distortion: largest, share of the paraxial height.
+        incidence: largest angle of a ray with a normal, on either side, degrees.
+        slope: largest angle of a normal with the axis, degrees.
     """
 
     air: float = -math.inf
     glass: tuple[float, float] = (-math.inf, math.inf)
     back: float = -math.inf
     distortion: float = math.inf
+    incidence: float = math.inf
+    slope: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -293,9 +297,15 @@ def _held(given: Any, count: int) -> set[int]:
 
 def _limits(entries: Sequence[Mapping[str, Any]]) -> Limits:
     """Return the limits of the residuals that have some."""
-    by_class = {str(e.get("class_path", "")).rpartition(".")[2]: e for e in entries}
-    paths = by_class.get("RayPathResiduals", {}).get("init_args") or {}
-    distortion = by_class.get("DistortionResiduals", {}).get("init_args") or {}
+    by_class = {
+        str(entry.get("class_path", "")).rpartition(".")[2]: entry.get("init_args") or {}
+        for entry in entries
+    }
+    paths = by_class.get("RayPathResiduals", {})
+
+    def largest(kind: str, key: str) -> float:
+        return float(by_class.get(kind, {}).get(key, math.inf))
+
     air = float(paths.get("min_cutoff", -math.inf))
     own = {int(place): float(least) for place, least in paths.get("other_min_cutoffs") or ()}
     return Limits(
@@ -305,7 +315,9 @@ def _limits(entries: Sequence[Mapping[str, Any]]) -> Limits:
             float(paths.get("max_cutoff_refractive", math.inf)),
         ),
         back=own.get(-1, air),
-        distortion=float(distortion.get("threshold", math.inf)),
+        distortion=largest("DistortionResiduals", "threshold"),
+        incidence=largest("RayAngleResiduals", "max_angle"),
+        slope=largest("SurfaceNormalResiduals", "max_angle"),
     )
 
 

@@ -192,6 +192,8 @@ class Measures:
         glass: least and largest on the axis, and least at an edge, mm.
         air: least on the axis and least at an edge, mm.
         spots: RMS about the polychromatic centroid at each field, µm.
+        incidence: largest angle of a ray with a normal, on either side, degrees.
+        slope: largest angle of a normal with the axis where light passes, degrees.
         light: least share of a field's beam that the field stop leaves.
     """
 
@@ -204,6 +206,8 @@ class Measures:
     glass: tuple[float, float, float]
     air: tuple[float, float]
     spots: tuple[float, ...]
+    incidence: float
+    slope: float
     light: float
 
     @property
@@ -221,6 +225,7 @@ def measures(lens: Lens, design: Design) -> Measures:
     """
     light = beams(lens, design)
     spots = spots_of(lens, design, light)
+    incidence, slope = angles_of(lens, design)
     first = lens.first_order(design.wavelength)
     values = values_of(lens, design)
     heights = [1.0 + 0.01 * v for k, v in values.items() if k.startswith("distortion")]
@@ -243,6 +248,8 @@ def measures(lens: Lens, design: Design) -> Measures:
         ),
         air=(min(by_kind["air_gap"]), min(by_kind["edge_air_gap"])),
         spots=tuple(spots),
+        incidence=incidence,
+        slope=slope,
         light=float(light.light.amin()),
     )
 
@@ -275,6 +282,33 @@ def spots_of(lens: Lens, design: Design, light: SpotRays) -> list[float]:
     squares = torch.zeros(design.fields, dtype=torch.float64)
     squares.index_add_(0, field, weight * (points - mean[field]).square().sum(-1))
     return [1e3 * math.sqrt(s) for s in squares.tolist()]
+
+
+@torch.no_grad()
+def angles_of(lens: Lens, design: Design) -> tuple[float, float]:
+    """Return the largest angles of incidence or refraction, and of normals with the axis, degrees.
+
+    Rays at the rim of every field's beam are looked at, at all refracting surfaces.
+    """
+    rays = beams(lens, design, 1).rays
+    hit = lens.trace(rays, record=True)
+    assert hit.points is not None  # they were asked for
+    points = torch.cat([rays.position[None], hit.points, hit.position[None]])
+    along = torch.nn.functional.normalize(points.diff(dim=0), dim=-1)
+    vertices, incidence, slope = lens.system().vertices, 0.0, 0.0
+    for number, read in enumerate(design.surfaces, 1):
+        if read.refracting is None:
+            continue
+        surface = lens.surfaces[str(number)]
+        values = {name: value.detach() for name, value in surface.named_parameters()}
+        x, y, z = hit.points[number - 1].unbind(-1)
+        normal = torch.stack(surface.normal(values, x, y, z - vertices[number - 1]), -1)
+        for segment in (along[number - 1], along[number]):
+            cosine = (segment * normal).sum(-1).abs().clamp(max=1.0)
+            incidence = max(incidence, float(torch.rad2deg(cosine.acos()).amax()))
+        steep = normal[:, 2].abs().clamp(max=1.0)
+        slope = max(slope, float(torch.rad2deg(steep.acos()).amax()))
+    return incidence, slope
 
 
 def operands_of(design: Design, weight: float = 1.0) -> list[dict[str, object]]:

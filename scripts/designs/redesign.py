@@ -34,6 +34,9 @@ _WEIGHT, _MARGIN = 500.0, 1e-3
 _RINGS, _ARMS = 6, 12
 # How far a start is from the design, at most: the largest of these with which every ray passes.
 _AWAY = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
+# What a degree of slope or incidence counts as, mm: half of one is no more than room.  The steps do
+# not know of angles; `kept` looks.
+_DEGREE = 0.004
 # A lens that distorts less than this part of what it may is not watched for it; `kept` looks.
 _FAR = 0.5
 # Of its gain a round without which no other follows.
@@ -117,7 +120,8 @@ def limits_of(design: Design, published: Measures) -> list[dict[str, Any]]:
 
 
 def kept(now: Measures, published: Measures, design: Design, room: float = 2e-3) -> list[str]:
-    """Return the names of limits that a lens breaks by more than `room`, mm or a share of 1/10.
+    """Return the names of limits that a lens breaks by more than `room`: mm, tenths of a share of
+    distortion, or 250°.
 
     Args:
         now: the lens.
@@ -135,6 +139,8 @@ def kept(now: Measures, published: Measures, design: Design, room: float = 2e-3)
         "track": now.total - published.total,
         "back": min(limits.back, published.back) - now.back,
         "efl": abs(now.efl - published.efl),
+        "incidence": _DEGREE * (now.incidence - max(limits.incidence, published.incidence)),
+        "slope": _DEGREE * (now.slope - max(limits.slope, published.slope)),
         "distortion": 10.0 * (now.distortion - max(limits.distortion, published.distortion)),
     }
     return [name for name, beyond in bounds.items() if beyond > room]
