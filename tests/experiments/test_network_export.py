@@ -35,7 +35,9 @@ def camera_of(network, size=(24, 20), functions=None):
     sensor = SimpleNamespace(height=size[0], width=size[1])
     return SimpleNamespace(
         network=network.eval(),
-        views=SimpleNamespace(sensor=sensor, point_spread_functions=lambda lens, values: functions),
+        views=SimpleNamespace(
+            sensor=sensor, readouts=None, point_spread_functions=lambda lens, values: functions
+        ),
         lens=None,
         variables=dict,
         noise=lambda: network.noise_arguments((0.01, 0.0009)),

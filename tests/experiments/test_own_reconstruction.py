@@ -80,7 +80,7 @@ def broken(restored, truth):
 
 def checked(network, loss=functional.l1_loss):
     network = restoration_of(network)
-    check_reconstruction(network, loss, SIZE, (2,))
+    check_reconstruction(network, loss, SIZE, 2)
     return network
 
 
