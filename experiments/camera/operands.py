@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.state_names import values_in_state
 from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operand_values import evaluate_operands
 from dolens.optimize.operands import UnreachableField, check_operand_fields, operand
@@ -47,6 +48,8 @@ class CameraOperands:
     def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return Σ (weight·deviation)² and the operands' values by label.
 
+        They are of the lens in none of its states.
+
         Args:
             lens: that they belong to.
             values: parameters that take the place of its own, by name; with a graph.
@@ -54,7 +57,8 @@ class CameraOperands:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        found = evaluate_operands(self.entries, lens, values, self.object_distance)
+        own = values_in_state(lens, None, values)
+        found = evaluate_operands(self.entries, lens, own, self.object_distance)
         total = torch.zeros((), device=lens.device)
         for penalty in found.penalties():
             total = total + penalty

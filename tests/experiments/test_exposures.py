@@ -260,3 +260,31 @@ def test_what_exposures_cannot_be_is_refused_in_one_line(camera, overrides, mess
 def test_a_network_of_several_readouts_is_not_exported(camera):
     with pytest.raises(InputError, match=r"exposures.readouts: each; allowed in an exported"):
         exportable(camera())
+
+
+def test_a_camera_of_a_field_tells_each_readout_s_function_of_each_place(composed):
+    """With operands of the lens, which are of none of its states."""
+    cfg = composed(
+        "experiment=form_camera",
+        "optimizer.lens=adam",
+        "renderer.sensor.height=32",
+        "renderer.sensor.width=32",
+        "psf_size=17",
+        "+lens.states={far: {sensor: {distance: 42.21}}, near: {sensor: {distance: 42.6}}}",
+        "++exposures={_target_: dolens.experiments.camera.views.exposures.Exposures}",
+        "~variables",
+        "++variables={states.*.sensor_distance: {scale: 0.05}}",
+    )
+    module = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+    textures = torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(0))
+    found, functions = module.take(module.variables(), textures, "train", 0)
+    views = found.raw.shape[1]
+    assert found.readouts.shape == (2, views, 2, 3, 32, 32)
+    assert functions.shape[:3] == (2 * views, 2, 1)
+    # Out of focus, the near state blurs more at each place.
+    peaks = functions.amax(dim=(-2, -1)).mean(dim=-1)[:, :, 0]
+    assert bool((peaks[:, 0] > 1.5 * peaks[:, 1]).all())
+    total, _ = module.lens_steps.penalty(module.variables())
+    loss = (module.restore(found, functions) - found.truth).square().mean() + total
+    (slope,) = torch.autograd.grad(loss, module.variables.scaled)
+    assert bool((slope != 0.0).all())
