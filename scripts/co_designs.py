@@ -19,10 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from dolens.errors import InputError
 from scripts.co_design.cases import CASES, candidates
 from scripts.co_design.results import table
-from scripts.co_design.training import Trainings
+from scripts.co_design.training import Trainings, file_of, photographs_in
 
 _TUNING_SEED = 100
-_PHOTOGRAPHS = ("data=package_photographs", "data.evaluation_crops_per_photograph=1")
 
 
 def run(
@@ -35,7 +34,7 @@ def run(
         for optimizer, settings in candidates(case).items():
             tuned = []
             for number, chosen in enumerate(settings):
-                file = folder / _file(name, optimizer, f"tuning_{number}")
+                file = folder / file_of(name, optimizer, f"tuning_{number}")
                 overrides = [*case.overrides, *chosen]
                 if not file.is_file():
                     found = trainings.scores(overrides, _TUNING_SEED, "val")
@@ -45,17 +44,13 @@ def run(
                 print(f"{name}, {optimizer}, {' '.join(chosen)}: {found['score']:.2f}", flush=True)
             chosen = settings[tuned.index(max(tuned))]
             for seed in seeds:
-                file = folder / _file(name, optimizer, f"seed_{seed}")
+                file = folder / file_of(name, optimizer, f"seed_{seed}")
                 if not file.is_file():
                     found = trainings.scores([*case.overrides, *chosen], seed, "test")
                     about = {"case": name, "optimizer": optimizer, "seed": seed}
                     file.write_text(json.dumps({**about, **found, "settings": list(chosen)}))
                 found = json.loads(file.read_text())
                 print(f"{name}, {optimizer}, seed {seed}: {found['score']:.2f}", flush=True)
-
-
-def _file(name: str, optimizer: str, rest: str) -> str:
-    return f"{name}_{optimizer}_{rest}.json".replace(", ", "_").replace(" ", "_")
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -70,8 +65,7 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     try:
         if given.what == "run":
-            folders = [f"data.folders=[{','.join(given.package_folders)}]"]
-            data = [*_PHOTOGRAPHS, *(folders if given.package_folders else [])]
+            data = photographs_in(given.package_folders)
             run(given.folder, given.cases, given.seconds, given.seeds, data)
         else:
             files = sorted(given.folder.glob("*_seed_*.json"))

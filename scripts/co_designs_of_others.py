@@ -20,9 +20,7 @@ from dolens.errors import InputError
 from scripts.co_design.cases import CASES
 from scripts.co_design.methods import METHODS, THEIRS
 from scripts.co_design.results import against
-from scripts.co_design.training import Trainings
-
-_PHOTOGRAPHS = ("data=package_photographs", "data.evaluation_crops_per_photograph=1")
+from scripts.co_design.training import Trainings, file_of, photographs_in
 
 
 def run(
@@ -41,9 +39,7 @@ def run(
             case = CASES[name]
             for method in methods:
                 how = METHODS[method]
-                file = folder / f"{name}_{method}_seed_{seed}.json".replace(", ", "_").replace(
-                    " ", "_"
-                )
+                file = folder / file_of(name, method, f"seed_{seed}")
                 if not file.is_file():
                     overrides = [*case.overrides, *how.overrides(case)]
                     found = trainings.scores(overrides, seed, "test", how.callbacks)
@@ -66,8 +62,7 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     try:
         if given.what == "run":
-            folders = [f"data.folders=[{','.join(given.package_folders)}]"]
-            data = [*_PHOTOGRAPHS, *(folders if given.package_folders else [])]
+            data = photographs_in(given.package_folders)
             run(given.folder, given.cases, given.methods, given.seconds, given.seeds, data)
         else:
             files = sorted(given.folder.glob("*_seed_*.json"))

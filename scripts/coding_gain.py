@@ -39,6 +39,7 @@ from scripts.coding.cameras import (
     refocused,
 )
 from scripts.coding.judged import (
+    MARGIN,
     RESTORERS,
     Motion,
     gain_at_worst,
@@ -46,10 +47,10 @@ from scripts.coding.judged import (
     restorer_of,
     scene_figure,
     scene_of,
-    scenes_of,
     scikit_image_scenes,
     scores_of,
 )
+from scripts.restoration_of_lenses import scenes_of
 
 RANGES = {
     "4.5 to 8 m": Range((8000.0, 6000.0, 4500.0)),
@@ -151,7 +152,7 @@ def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], f
     if file is None:
         raise InputError("scene: --figure FILE is missing")
     name, scene = next(iter(RANGES.items()))
-    validation = scenes_of([str(f) for f in folders], "val")
+    validation = scenes_of(folders, "val", MARGIN)
     photographs = scikit_image_scenes()[: len(scene.depths)]
     restorer = "by depth"
     judges = (scene, light, restorer, validation)
@@ -198,7 +199,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--restorers", nargs="+", choices=RESTORERS, default=["blind", "by depth"])
     parser.add_argument("--motions", nargs="+", default=["0:known"], help="pixels:what is known")
-    parser.add_argument("--package-folders", nargs="*", default=data_folders())
+    parser.add_argument("--package-folders", nargs="*", type=Path, default=data_folders())
     parser.add_argument("--photographs", type=int, help="of the 42, evenly chosen")
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args(arguments)
@@ -221,11 +222,12 @@ def main(arguments: Sequence[str]) -> int:
                 print(f"| {light:g} | {' | '.join(cells)} |")
             points: dict[str, dict[float, tuple[float, float, float]]] = {}
             if given.command == "judge":
-                folders = [str(folder) for folder in given.package_folders]
-                photographs = (
-                    scenes_of(folders, "val"),
-                    scenes_of(folders, "test", given.photographs),
+                validation, test = (
+                    scenes_of(given.package_folders, split, MARGIN) for split in ("val", "test")
                 )
+                count = min(given.photographs or len(test), len(test))
+                chosen_ones = torch.linspace(0, len(test) - 1, count).round().long()
+                photographs = validation, test[chosen_ones]
                 print(
                     f"\n{name}: PSNR in dB of restored photographs by depth; gains over the best "
                     "plain lens at the worst depth and of the mean, 95 %\n\n"

@@ -150,16 +150,22 @@ def functions_of(name: str, wrong: str | None = None) -> Tensor:
     return found.unflatten(1, (3, -1)).mean(2).float()
 
 
-def scenes_of(folders: Sequence[Path]) -> Tensor:
-    """Return the middles of the 42 test photographs with margins, linear light, (42, 3, S, S)."""
+def scenes_of(folders: Sequence[Path], split: str = "test", margin: int = MARGIN) -> Tensor:
+    """Return the middles of the photographs of a split with margins, linear light, (P, 3, S, S).
+
+    Args:
+        folders: of `data=package_photographs`.
+        split: `val` (14) or `test` (42).
+        margin: pixels at each edge.
+    """
     data = PackagePhotographsDataModule(
         folders=[str(folder) for folder in folders],
         crop_size=SIDE,
-        margin=MARGIN,
+        margin=margin,
         evaluation_crops_per_photograph=1,
         evaluation_scale=SCALE,
     )
-    return torch.cat(list(data.test_dataloader()))
+    return torch.cat(list(data.val_dataloader() if split == "val" else data.test_dataloader()))
 
 
 class Pictures(NamedTuple):

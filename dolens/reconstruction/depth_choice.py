@@ -23,6 +23,7 @@ from torch.nn.functional import conv2d, pad
 from dolens.reconstruction.untrained import REFERENCE_VARIANCE
 from dolens.reconstruction.wiener import (
     close_periodically,
+    half_spectrum_counts,
     padded_lengths,
     squared_frequency,
     transfer_function,
@@ -63,11 +64,7 @@ def depth_probabilities(raw: Tensor, functions: Tensor, noise: Tensor) -> Tensor
     spectrum = torch.fft.rfft2(close_periodically(light, rows, columns))
     square = squared_frequency(rows, columns, raw)
     square[0, 0] = square[0, 1]
-    # Each frequency but those of the first and last columns stands for its opposite too.
-    share = torch.full_like(square, 2.0 / (rows * columns))
-    share[:, 0] = share[:, 0] / 2.0
-    if columns % 2 == 0:
-        share[:, -1] = share[:, -1] / 2.0
+    share = half_spectrum_counts(columns, square) / (rows * columns)
     variance = noise[:, 0] * light.mean(dim=(-2, -1)).clamp(min=0.0) + noise[:, 1]
     deviation = (variance / 3.0).clamp(min=1e-9).sqrt()[..., None, None]  # (B, N, 1, 1)
     spectrum = spectrum / deviation

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.reconstruction.wiener import half_spectrum_counts
+
 
 class LinearError(NamedTuple):
     """A `LinearError` holds mean squared errors of D depths, in the image's units squared, each
@@ -95,8 +97,5 @@ def linear_error_of_readouts(functions: Tensor, spectrum: Tensor, noise: float) 
 
 def _mean(values: Tensor, columns: int) -> Tensor:
     """Average over all frequencies of a real image, of which the transform holds one half."""
-    weight = values.new_full(values.shape[-1:], 2.0)
-    weight[0] = 1.0
-    if columns % 2 == 0:
-        weight[-1] = 1.0
+    weight = half_spectrum_counts(columns, values)
     return (values * weight).sum((-2, -1)) / (values.shape[-2] * columns)

@@ -16,7 +16,11 @@ from torch import Tensor
 
 from dolens.reconstruction.readouts import shifted
 from dolens.reconstruction.untrained import REFERENCE_VARIANCE
-from dolens.reconstruction.wiener import squared_frequency, transfer_function
+from dolens.reconstruction.wiener import (
+    half_spectrum_counts,
+    squared_frequency,
+    transfer_function,
+)
 
 _NEWTON_STEPS, _ROUNDS = 6, 3
 # Share of each side over which an image fades out: its edges move by themselves.
@@ -65,11 +69,7 @@ def _motion_left(
     square = squared_frequency(rows, columns, raw)
     square[0, 0] = square[0, 1]
     signal = REFERENCE_VARIANCE / 3.0 / square
-    # Each frequency but those of the first and last columns stands for its opposite too.
-    count = torch.full_like(square, 2.0)
-    count[:, 0] = 1.0
-    if columns % 2 == 0:
-        count[:, -1] = 1.0
+    count = half_spectrum_counts(columns, square)
     found = torch.zeros(*raw.shape[:2], 2).to(raw)
     for n in range(raw.shape[1]):
         if n == reference:
@@ -91,9 +91,7 @@ def _peaks(cross: Tensor, rows: int, columns: int, reach: float) -> tuple[Tensor
     """Return where Re Σ cross·e^(2πi f·s) is largest, (B, D, 2), and its value there, (B, D)."""
     area = math.ceil(reach)
     # The full spectrum counts both halves; `cross` has counted them.
-    half = cross.clone()
-    last = columns // 2 + 1 - (columns % 2 == 0)
-    half[..., 1:last] = half[..., 1:last] / 2.0
+    half = cross / half_spectrum_counts(columns, cross.real)
     surface = torch.fft.irfft2(half, s=(rows, columns), norm="forward")
     offsets = torch.arange(-area, area + 1)
     near = surface[..., offsets.remainder(rows), :][..., offsets.remainder(columns)]

@@ -120,6 +120,19 @@ def transfer_function(point_spread_function: Tensor, rows: int, columns: int) ->
     return torch.fft.rfft2(centred)
 
 
+def half_spectrum_counts(columns: int, like: Tensor) -> Tensor:
+    """Return for how many frequencies each column of `torch.fft.rfft2` stands, (columns // 2 + 1,).
+
+    Two, as a real image has the same power at a frequency and at its opposite; one in the first,
+    and where the number of columns is even in the last.
+    """
+    counts = like.new_full((columns // 2 + 1,), 2.0)
+    counts[0] = 1.0
+    if columns % 2 == 0:
+        counts[-1] = 1.0
+    return counts
+
+
 def squared_frequency(rows: int, columns: int, like: Tensor) -> Tensor:
     """Return (f / f_N)² on the grid of `torch.fft.rfft2`, (rows, columns//2 + 1), in the dtype and
     on the device of `like`; f_N = 1/2 cycle/pixel along an axis.

@@ -24,7 +24,12 @@ from dolens.reconstruction.general import (
 )
 from dolens.reconstruction.opponent_wiener import colour_filters, correlations
 from dolens.reconstruction.restoration import COLORS, WienerUNetRestoration
-from dolens.reconstruction.wiener import close_periodically, padded_lengths, wiener_filter
+from dolens.reconstruction.wiener import (
+    close_periodically,
+    half_spectrum_counts,
+    padded_lengths,
+    wiener_filter,
+)
 from dolens.sensor.colour import linear_to_srgb
 
 
@@ -49,10 +54,7 @@ class FourierMatrices(nn.Module):
         self.rows, self.columns = rows, columns
         half = columns // 2 + 1
         # A real image's spectrum is known by half of its columns: the others count through these.
-        counts = torch.full((half,), 2.0, dtype=torch.float64)
-        counts[0] = 1.0
-        if columns % 2 == 0:
-            counts[-1] = 1.0
+        counts = half_spectrum_counts(columns, torch.zeros((), dtype=torch.float64))
         cosine, sine = _matrices(columns, half)
         inverse = counts / (rows * columns)
         stored = {

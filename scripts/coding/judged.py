@@ -1,14 +1,13 @@
 """Cameras for an extended depth of field are judged on photographs, by wave optics."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.experiments.data.package_photographs import PackagePhotographsDataModule
 from dolens.experiments.data.photos import PhotosDataModule
 from dolens.experiments.pretraining.examples import blurred
 from dolens.plotting.style import PAGE, SMALL
@@ -20,8 +19,9 @@ from dolens.reconstruction.readouts import shifted
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 from scripts.coding.cameras import DepthCamera, Range, noise_of, wave_functions
+from scripts.restoration_of_lenses import SIDE
 
-SIDE, MARGIN, SCALE = 128, 64, 1.5
+MARGIN = 64
 # Pixels along each side of functions beyond which light is cut off: the margin's.
 _LARGEST = 2 * MARGIN + 1
 _INNER = (..., slice(MARGIN, MARGIN + SIDE), slice(MARGIN, MARGIN + SIDE))
@@ -41,29 +41,8 @@ class Motion(NamedTuple):
     knowledge: str = "known"
 
 
-def scenes_of(folders: Sequence[str], split: str, limit: int | None = None) -> Tensor:
-    """Return photographs' middles with margins, linear light, (P, 3, S, S).
-
-    Args:
-        folders: of `data=package_photographs`.
-        split: `val` (14) or `test` (42).
-        limit: evenly chosen ones; None: all.
-    """
-    data = PackagePhotographsDataModule(
-        folders=list(folders),
-        crop_size=SIDE,
-        margin=MARGIN,
-        evaluation_crops_per_photograph=1,
-        evaluation_scale=SCALE,
-    )
-    found = torch.cat(list(data.val_dataloader() if split == "val" else data.test_dataloader()))
-    if limit is None:
-        return found
-    return found[torch.linspace(0, len(found) - 1, min(limit, len(found))).round().long()]
-
-
 def scikit_image_scenes() -> Tensor:
-    """Return the middles of the three test photographs of `data=photos`, as `scenes_of`."""
+    """Return the middles of the three test photographs of `data=photos`, (3, 3, S, S)."""
     data = PhotosDataModule(
         crop_size=SIDE,
         margin=MARGIN,

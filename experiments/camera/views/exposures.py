@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -132,6 +132,13 @@ class ExposedViews(Imaging):
     def _first(self) -> Imaging:
         return next(iter(self.parts.values()))
 
+    def _states(
+        self, lens: Lens, values: Mapping[str, Tensor]
+    ) -> Iterator[tuple[Imaging, Lens, Mapping[str, Tensor]]]:
+        """Yield the views of each state, the lens in it, and its values there."""
+        for name, part in self.parts.items():
+            yield part, lens.in_state(name), values_there(lens, name, values)
+
     @property
     def image_sensor(self) -> Sensor:
         """The whole sensor, of which an image may be a window."""
@@ -180,9 +187,8 @@ class ExposedViews(Imaging):
         motion = self._motion(stage, index).to(textures)
         told = (reference,) if share is None else (reference, share)
         found = []
-        for moved, (name, part) in zip(motion, self.parts.items(), strict=True):
+        for moved, (part, *state) in zip(motion, self._states(lens, values), strict=True):
             there = shifted(textures, moved) if bool(moved.any()) else textures
-            state = (lens.in_state(name), values_there(lens, name, values))
             found.append(part.take(*state, there, stage, index, *told))
         middle = found[len(found) // 2]  # which does not move
         shares = list(self.shares.values())
@@ -227,10 +233,8 @@ class ExposedViews(Imaging):
 
     def _of_states(self, lens: Lens, values: Mapping[str, Tensor], *asked: Any) -> Sequence[Tensor]:
         return [
-            part.point_spread_functions(
-                lens.in_state(name), values_there(lens, name, values), *asked
-            )
-            for name, part in self.parts.items()
+            part.point_spread_functions(*state, *asked)
+            for part, *state in self._states(lens, values)
         ]
 
     def functions_of_images(
@@ -244,10 +248,8 @@ class ExposedViews(Imaging):
             where functions are the same for all images, and the scene rests.
         """
         places = [
-            part.functions_of_images(
-                lens.in_state(name), values_there(lens, name, values), taken, stage
-            )
-            for name, part in self.parts.items()
+            part.functions_of_images(*state, taken, stage)
+            for part, *state in self._states(lens, values)
         ]
         own = [functions for functions in places if functions is not None]
         known = self.settings.motion_is if self.settings.motion else "ignored"
@@ -296,7 +298,7 @@ class ExposedViews(Imaging):
         if not self.has_plain_exposure:
             return None
         name = self.settings.beside
-        state = (lens.in_state(name), values_there(lens, name, values))
+        state = lens.in_state(name), values_there(lens, name, values)
         taken = self._plain.take(*state, textures, stage, index, reference)
         functions = self._plain.point_spread_functions(*state)
         return PlainExposure(taken, functions, self._plain.readout.noise)
@@ -312,10 +314,8 @@ class ExposedViews(Imaging):
         if self.view_is_known:
             raise InputError("exposures: whole pictures of a field; allowed: exposures=null")
         found = [
-            part.whole_picture(
-                lens.in_state(name), values_there(lens, name, values), picture, placing
-            )
-            for name, part in self.parts.items()
+            part.whole_picture(*state, picture, placing)
+            for part, *state in self._states(lens, values)
         ]
         images = torch.stack([one.image for one in found], dim=1)
         weights = images.new_tensor(list(self.shares.values()))
@@ -377,9 +377,8 @@ class ExposedViews(Imaging):
         photographs: Tensor | None = None,
     ) -> None:
         """Let the training renderer look at the lens in each state, by the images alone."""
-        for name, part in self.parts.items():
-            there = values_there(lens, name, values)
-            part.prepare(lens.in_state(name), there, None, photographs)
+        for part, *state in self._states(lens, values):
+            part.prepare(*state, None, photographs)
 
     def rays(self) -> int:
         """Rays that a training image takes, in all states; 0 before a renderer is chosen."""
