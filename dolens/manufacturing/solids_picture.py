@@ -39,12 +39,6 @@ def triangles(solid: Shape) -> np.ndarray:
     return np.concatenate(found)
 
 
-def mesh_volume(corners: np.ndarray) -> float:
-    """Return the volume (mm³) that closed triangles (N, 3, 3) enclose: Σ a·(b × c)/6."""
-    a, b, c = corners.transpose(1, 0, 2)
-    return float((a * np.cross(b, c)).sum() / 6.0)
-
-
 def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
     """Draw solids obliquely, whole and cut open along the plane x = 0.
 

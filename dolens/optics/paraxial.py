@@ -201,17 +201,6 @@ def first_order(
     )
 
 
-def image_distance(system: OpticalSystem, wavelength: float | Tensor, depth: float) -> Tensor:
-    """z (mm from the first vertex) of the paraxial image of an object at -depth mm."""
-    indices = system.signed_indices(wavelength)
-    matrix = surface_matrix(system, wavelength, 1, len(system.surfaces))
-    # From the axial object point: the height at the first vertex, per unit of reduced slope.
-    gap = depth / indices[0]
-    height, slope = matrix[:, 0] * gap + matrix[:, 1]
-    z_last = system.vertices[len(system.surfaces) - 1]
-    return z_last - indices[-1] * height / slope
-
-
 def chief_ray_magnification(
     system: OpticalSystem, wavelength: float | Tensor, depth: float
 ) -> Tensor:

@@ -1,7 +1,6 @@
 """Names of the parameters that a state of a lens has for itself: `states.wide.thicknesses.5`."""
 
-import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 Value = TypeVar("Value")
@@ -40,14 +39,3 @@ def values_in_state(lens: Any, state: str | None, values: Mapping[str, Value]) -
         elif not name.startswith(f"{STATES}.") and name not in hidden:
             found[name] = value
     return found
-
-
-def states_of_pattern(name: str, states: Sequence[str]) -> list[str]:
-    """Return the states that a name or pattern of a parameter means; none of a shared one.
-
-    Args:
-        name: as `states.*.sensor_distance`; wildcards may stand in the state.
-        states: of the lens.
-    """
-    state, _ = split_state(name)
-    return [] if state is None else fnmatch.filter(states, state)

@@ -17,13 +17,15 @@ from dolens.plotting.starts import starts_figure
 
 
 def search_figures(finds: Finds, reports: Sequence[FormReport], name: str) -> Figures:
-    """Return the sections of all forms, the search's course and the map of starts."""
+    """Return the sections of all forms, the search's course and the map of starts.
+
+    Starts of a single element differ in nothing that a map could show, and have none.
+    """
     if not finds.found:
         return {}
-    found: dict[str, Callable[[], Figure]] = {
-        "course": lambda: course_picture(finds, name),
-        "starts": lambda: starts_picture(finds, name),
-    }
+    found: dict[str, Callable[[], Figure]] = {"course": lambda: course_picture(finds, name)}
+    if all(features.shape[1] > 1 for features in finds.features.values()):
+        found["starts"] = lambda: starts_picture(finds, name)
     sections = sections_figure(reports, f"{name}: mean RMS spot of each form")
     return found if sections is None else {"forms": lambda: sections, **found}
 

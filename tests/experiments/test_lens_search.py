@@ -91,3 +91,13 @@ def test_a_lens_that_a_search_would_not_read_is_refused(finished):
     *_, composed = finished
     with pytest.raises(InputError, match="lens: a search makes its own lens"):
         run(composed(*SMALL, "lens=cooke_triplet", folder="third"))
+
+
+def test_a_single_element_has_forms_and_a_course_but_no_map_of_its_one_power(finished):
+    _, folder, composed = finished
+    single = ("specification.groups=[1]", "specification.limits.distortion=null")
+    run(composed(*SMALL, *single, folder="single"))
+    folder = folder.parent / "single"
+    assert figure_names(folder) >= {"forms", "course"}
+    assert "starts" not in figure_names(folder)
+    assert load_lens(folder / "forms" / "form_01.yaml").surfaces

@@ -11,11 +11,13 @@ from dolens import load_lens
 from dolens.errors import InputError
 from dolens.lens_search.course import search_course
 from dolens.lens_search.files import SUFFIXES, write_form
+from dolens.lens_search.form_report import report_form
 from dolens.lens_search.form_words import element_powers, glasses_text, powers_text
 from dolens.lens_search.forms import distinct
 from dolens.lens_search.found import FoundLens
+from dolens.lens_search.page import Pictures
 from dolens.lens_search.requirements import Requirements
-from dolens.lens_search.results import Starts, write_results
+from dolens.lens_search.results import sections_figure, write_page
 from dolens.lens_search.sensitivity import lens_sensitivity
 from dolens.lens_search.start_map import start_map
 
@@ -99,13 +101,13 @@ def test_the_results_of_a_search(triplet, tmp_path):
     ]
     forms = distinct(lenses)
     assert [form.places for form in forms] == [(0, 1), (2,)]
-    features = torch.tensor([[1.0, -2.0, 1.5], [0.5, -2.2, 1.1], [3.0, 1.0, -1.0]])
-    starts = Starts(start_map(features, ["φ₁", "φ₂", "φ₃"]), torch.tensor([0, 0, 1]), 40)
-    course = search_course([3.0, 1.0, 2.0], [10.0, 50.0, 11.0], [0, 1, 0])
     required = Requirements(50.0, total_track=65.0, back_focus=45.0, vignetting=0.5)
-    reports = write_results(
-        forms, tmp_path, required, "Triplets & more", [("F/", "5")], starts, course
-    )
+    reports = [
+        report_form(form.best, rank, required, tmp_path, len(form.starts), len(form.members))
+        for rank, form in enumerate(forms, 1)
+    ]
+    pictures = Pictures(sections_figure(reports, "Triplets"), None)
+    write_page(reports, tmp_path, "Triplets & more", [("F/", "5")], pictures, len(forms))
     assert [report.powers for report in reports] == ["+ − | +", "+ − | +"]
     assert "back focus" in reports[0].broken and not reports[0].problems
     text = (tmp_path / "forms.html").read_text(encoding="utf-8")
@@ -118,13 +120,7 @@ def test_the_results_of_a_search(triplet, tmp_path):
     for link in page.links:
         assert not link.startswith("#") or f'id="{link[1:]}"' in text
     assert "back focus</span>" in text  # red, with the sign of what is not kept
-    for name in ("forms", "starts", "merit_over_time"):
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_search_that_found_nothing_is_an_error(tmp_path):
-    with pytest.raises(InputError, match="no lens"):
-        write_results([], tmp_path, Requirements(), "nothing")
+    assert sections_figure([]) is None
 
 
 def test_forms_near_the_best_so_far_are_counted_over_time():

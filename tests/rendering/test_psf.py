@@ -50,13 +50,13 @@ def test_the_blur_of_the_plain_lens_is_the_geometric_disc(wavefront_coding):
     # Paraxially the blur at 8 m is a uniform disc; its second moment about the axis is a²/2 with
     # a = (exit pupil radius)·|defocus|/(distance), plus 1/4 pixel² from the quadratic B-spline in
     # each direction.  Stopped down to 2 mm, so that spherical aberration does not add to it.
-    from dolens.optics.paraxial import exit_pupil, image_distance
+    from dolens.optics.paraxial import exit_pupil
 
     lens = wavefront_coding()
     lens.surfaces["1"].aperture = ClearAperture(Circle(1.0))
     sensor = Sensor(64, 64, 0.001)
     system = lens.system()
-    image_z = float(image_distance(system, 587.5618, 8000.0))
+    image_z = float(lens.first_order(587.5618, 8000.0).image)
     pupil = exit_pupil(system, 587.5618)
     sensor_z = float(system.vertices[-1])
     a = float(pupil.diameter) / 2 * abs(sensor_z - image_z) / (image_z - float(pupil.z))

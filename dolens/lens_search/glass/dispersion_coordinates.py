@@ -38,7 +38,6 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.materials import INDEX_MODELS, LINE_C, LINE_D, LINE_F, Medium
 from dolens.optics.model_glass import LINE_G, model_glass
-from dolens.optics.paraxial_recurrence import Number
 
 # nd, nF - nC and (nF - nC) ΔPgF at the coordinates (0, 0, 0), and of a step of 1.
 CENTRE = (1.6, 0.012, 0.0)
@@ -71,20 +70,6 @@ class DispersionBasis:
     def derivative(self, coordinates: Tensor) -> Tensor:
         """Return ∂n/∂coordinates, (..., C, W): the same matrix for every glass, not copied."""
         return self.slopes.expand(*coordinates.shape[:-1], *self.slopes.shape)
-
-    def index_at(self, coordinates: Sequence[Number], wavelength: int) -> Number:
-        """Return the index at one of the wavelengths from C numbers, which may carry derivatives.
-
-        Args:
-            coordinates: C numbers, tensors of a shape or `Tangents`.
-            wavelength: its number.
-        """
-        slopes = self.slopes[:, wavelength].tolist()
-        terms = [x * slope for x, slope in zip(coordinates, slopes, strict=True)]
-        total = terms[0] + float(self.offset[wavelength])
-        for term in terms[1:]:
-            total = total + term
-        return total
 
 
 def conrady_basis(wavelengths: Sequence[float], count: int = 3) -> DispersionBasis:
