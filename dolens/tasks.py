@@ -1,19 +1,11 @@
-"""Independent tasks are mapped by a function that decides where they run.
-
-What loops over lenses or measurements takes a `TaskMap` and leaves the loop to it:
-
-    for found in map_tasks(trace_one, lenses, "lenses"):
-        ...
-
-`in_turn` runs tasks where it is called.  `dolens.experiments.workers` has maps whose tasks run in
-other processes; for those the function and the tasks must be picklable.
-"""
+"""Work: independent tasks, mapped by a function that decides where they run, and named stages."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, NamedTuple, Protocol
 
 from dolens.errors import InputError, one_line
-from dolens.stages import stage
 
 
 class TaskMap(Protocol):
@@ -65,3 +57,58 @@ def error_of_task(label: str, error: BaseException) -> Exception:
     if isinstance(error, InputError):
         return InputError(one_line(f"{label}: {error}"))
     return TaskError(one_line(f"{label}: {type(error).__name__}: {error}"))
+
+
+class StageEvent(NamedTuple):
+    """A stage begins or ends.
+
+    Attributes:
+        names: of the stage, behind those of the stages that it is a part of.
+        begins: True at its beginning, False at its end.
+    """
+
+    names: tuple[str, ...]
+    begins: bool
+
+
+Listener = Callable[[StageEvent], None]
+
+_listeners: ContextVar[tuple[Listener, ...]] = ContextVar("dolens_listeners", default=())
+_names: ContextVar[tuple[str, ...]] = ContextVar("dolens_stages", default=())
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Tell listeners that a named piece of work begins and, however it goes, that it has ended.
+
+    Args:
+        name: what is done, in a few words, such as "planning the renderer"; a detail that
+            changes stands behind a colon, as in "starts: 3 of 50".
+    """
+    names = (*_names.get(), name)
+    token = _names.set(names)
+    _tell(StageEvent(names, True))
+    try:
+        yield
+    finally:
+        _names.reset(token)
+        _tell(StageEvent(names, False))
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Have a function called at the beginning and at the end of every stage.
+
+    Args:
+        listener: is called in the thread that does the work, and should return at once.
+    """
+    token = _listeners.set((*_listeners.get(), listener))
+    try:
+        yield
+    finally:
+        _listeners.reset(token)
+
+
+def _tell(event: StageEvent) -> None:
+    for listener in _listeners.get():
+        listener(event)

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text, read_file
-from dolens.whole_files import written_whole
+from dolens.files import decode_text, read_file, written_whole
 
 Row = Mapping[str, float | str]
 # A table of a thousand columns and ten thousand rows has less.

@@ -29,7 +29,7 @@ import torch
 from benchmarks.peer_readers import Optiland, RayOptics, Traced, UnlikeError, array
 
 from dolens.errors import InputError, one_line
-from dolens.file_text import decode_text
+from dolens.files import decode_text
 from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays

@@ -20,7 +20,7 @@ from typing import Any
 import yaml
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text
+from dolens.files import decode_text
 from dolens.optics.agf import parse_agf, read_entry
 from dolens.optics.dispersion import Formula, cauchy, polynomial, sellmeier, sellmeier_squared
 

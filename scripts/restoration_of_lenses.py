@@ -44,7 +44,7 @@ from dolens.reconstruction import (
     psnr_db,
     structural_similarity,
 )
-from dolens.reconstruction.intervals import gain_interval
+from dolens.reconstruction.quality import gain_interval
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.colour import linear_to_srgb

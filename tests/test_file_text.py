@@ -11,7 +11,7 @@ from dolens import InputError, load_lens
 from dolens.cli.app import app
 from dolens.experiments.camera_search.forms import forms_of_run
 from dolens.experiments.data.package_photographs import read_manifest
-from dolens.file_text import read_file
+from dolens.files import read_file
 from dolens.lens_page.offenders import _read as read_tolerances
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.glass_folders import glass_folders

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from dolens import InputError, load_lens
 from dolens.cli.app import app
-from dolens.manufacturing.step_file import read_step_file
+from dolens.manufacturing.step import read_step_file
 from dolens.plotting import layout_figure
 from dolens.prescriptions.conversion import converted
 from dolens.prescriptions.files import (

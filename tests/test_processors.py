@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from dolens.cli import threads
-from dolens.processors import ThreadClock, allowed_processors, processors
+from dolens import threads
+from dolens.threads import ThreadClock, allowed_processors, processors
 
 PLENTY = 64
 
@@ -71,7 +71,7 @@ def test_the_affinity_mask_counts_and_files_may_be_missing(tmp_path, monkeypatch
 
 BESIDE = """
 import os, subprocess, sys, time
-from dolens.processors import ThreadClock
+from dolens.threads import ThreadClock
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 busy = "while True: pass"
 other = subprocess.Popen([sys.executable, "-c", busy])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens.experiments.camera.views.base import SCENE_OFFSET, seed_of
-from dolens.seeded_generators import generator_of
+from dolens.sensor.noise import generator_of
 
 
 def test_every_bit_of_a_seed_counts():

@@ -7,9 +7,8 @@ import sys
 
 import pytest
 
-from dolens import spinning
-from dolens.processors import ThreadClock, ThreadTimes
-from dolens.spinning import POLICY, SpinControl
+from dolens import threads
+from dolens.threads import POLICY, SpinControl, ThreadClock, ThreadTimes
 
 ALONE, BESIDE, BETWEEN, IDLE = (
     ThreadTimes(1.0, 0.01),
@@ -95,36 +94,36 @@ def clean(monkeypatch):
     monkeypatch.delitem(sys.modules, "torch", raising=False)
     # Whatever a test sets goes with it.
     monkeypatch.setattr(os, "environ", dict(os.environ))
-    monkeypatch.setattr(spinning, "ThreadClock", lambda: Clock([ALONE]))
+    monkeypatch.setattr(threads, "ThreadClock", lambda: Clock([ALONE]))
     started = []
-    monkeypatch.setattr(spinning.threading.Thread, "start", lambda thread: started.append(thread))
+    monkeypatch.setattr(threads.threading.Thread, "start", lambda thread: started.append(thread))
     monkeypatch.started = started
     return monkeypatch
 
 
 def test_the_program_follows_other_work(clean):
-    spinning.choose_waiting()
+    threads.choose_waiting()
     assert {name: os.environ[name] for name in POLICY} == POLICY
     assert len(clean.started) == 1 and clean.started[0].daemon
 
 
 def test_a_process_that_has_the_policy_from_its_parent_follows_other_work(clean):
-    spinning.follow_other_work()
+    threads.follow_other_work()
     assert not clean.started  # a program of a user's that uses this library
     os.environ |= POLICY
-    spinning.follow_other_work()
+    threads.follow_other_work()
     assert len(clean.started) == 1
 
 
 def test_one_thread_is_not_watched(clean):
     os.environ["OMP_NUM_THREADS"] = "1"
-    spinning.choose_waiting()
+    threads.choose_waiting()
     assert not clean.started
 
 
 def test_where_the_system_does_not_count_threads_sleep_soon(clean):
-    clean.setattr(spinning, "ThreadClock", lambda: Clock([None]))
-    spinning.choose_waiting()
+    clean.setattr(threads, "ThreadClock", lambda: Clock([None]))
+    threads.choose_waiting()
     assert os.environ["OMP_WAIT_POLICY"] == "passive" and int(os.environ["GOMP_SPINCOUNT"]) < 10_000
     assert not clean.started
 
@@ -133,7 +132,7 @@ def test_where_the_system_does_not_count_threads_sleep_soon(clean):
 def test_a_users_own_waiting_stays(clean, name):
     os.environ[name] = "7"
     before = dict(os.environ)
-    spinning.choose_waiting()
+    threads.choose_waiting()
     assert os.environ == before and not clean.started
 
 
@@ -145,7 +144,7 @@ def test_a_library_import_changes_nothing(root):
 FOLLOWED = """
 import os, time
 from dolens import spinning
-from dolens.processors import ThreadTimes
+from dolens.threads import ThreadTimes
 spinning.choose_waiting()
 spinning.follow_other_work()  # one thread watches, however often it is asked for
 spinning._LAP_S = 0.01

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dolens.stages import listening, stage
+from dolens.tasks import listening, stage
 
 
 def test_a_listener_hears_of_stages_and_of_their_parts():

@@ -4,7 +4,7 @@ import errno
 
 import pytest
 
-from dolens.whole_files import written_whole
+from dolens.files import written_whole
 
 
 def test_what_was_written_takes_the_place_of_the_file(tmp_path):

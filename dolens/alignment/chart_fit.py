@@ -7,8 +7,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dolens.alignment.chart import MarkWindows, WeightedSums
 from dolens.alignment.chart_model import ChartModel, MarkSums
-from dolens.alignment.mark_windows import MarkWindows, WeightedSums
 from dolens.errors import InputError
 
 # A mark's located centroid is right to about a pixel: so it is weighted, and fitted first.

@@ -1,17 +1,203 @@
-"""Photographs of a chart are functions of a camera's parameters, with their derivatives."""
+"""Photographs of a chart are functions of a camera's parameters, with their derivatives.
 
+The light of a mark goes through the lens in a few rays, whose places follow the lens.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.alignment.chart import CHART_POSE
-from dolens.alignment.chart_rays import ChartRays
-from dolens.alignment.gaussian_derivatives import smoothed_weights
-from dolens.alignment.mark_windows import WeightedSums
-from dolens.alignment.sensor_pose import SENSOR_POSE, OnSensor, on_sensor
+from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, Chart, OnSensor, WeightedSums, on_sensor
+from dolens.alignment.gaussian_filters import smoothed_weights
+from dolens.errors import InputError
+from dolens.optics.dispersion import require_wavelengths
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Components
 from dolens.optics.row_jacobian import forward_columns
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
+
+# The rim of the beam is searched by halves from here, in radii of the entrance pupil, and then by a
+# step of Newton's; its slope is a difference over so much of a radius.
+_FARTHEST, _HALVES, _DIFFERENCE = 1.6, 14, 1e-5
+
+
+@dataclass(frozen=True)
+class ChartRays:
+    """Samples the beams of a chart's marks by a quadrature that follows the beams' rims.
+
+    Rays aim at the plane of the lens's entrance pupil as designed.  On each of several arms the
+    rim lies where the first aperture clips, ρ(φ), and is found anew for every lens: Gauss and
+    Legendre's nodes in ρ² up to there make means exact up to high order, with corners of the rim an
+    error of 1/arms².  With ρ₀ the rim of the lens at hand and m how far inside all apertures a ray
+    passes,
+
+        ρ(θ) = ρ₀ - m(ρ₀, θ)/m'(ρ₀),
+
+    is the rim to second order and has its derivative, so that light is clipped in values and in
+    derivatives alike.
+
+    Attributes:
+        lens: as designed; it stays as it is.
+        chart: the marks.
+        wavelengths: nm, all weighted alike.
+        rings: nodes along an arm.
+        arms: azimuths of the pupil.
+    """
+
+    lens: Lens
+    chart: Chart
+    wavelengths: Sequence[float]
+    rings: int = 5
+    arms: int = 16
+
+    def __post_init__(self) -> None:
+        for key in ("rings", "arms"):
+            if not getattr(self, key) >= 2:
+                raise InputError(f"pupil.{key}: {getattr(self, key)}; allowed: 2 or more")
+        require_wavelengths(self.wavelengths, "wavelengths")
+
+    @property
+    def pupil(self) -> tuple[float, float]:
+        """Return where the entrance pupil is, mm from the first vertex, and its radius, mm."""
+        found = self.lens.first_order(self.lens.primary_wavelength).entrance_pupil
+        return float(found.z.detach()), 0.5 * float(found.diameter.detach())
+
+    def system(self, values: Mapping[str, Tensor]) -> OpticalSystem:
+        """Return the lens with other values, traced by the reference."""
+        return self.lens.system(values).traced_by("reference")
+
+    @torch.no_grad()
+    def rims(self, system: OpticalSystem, pose: Tensor, places: Tensor | None = None) -> Tensor:
+        """Return the rim ρ₀ and its slope m' of every mark's beam, (2, D, arms), mm and 1/mm.
+
+        Args:
+            system: the lens.
+            pose: (6,), of the chart.
+            places: (D, 2), on the chart, mm; None: the marks' centres.
+
+        Raises:
+            InputError: a mark whose light does not pass.
+        """
+        start = self._starts(pose, places)[:, None]
+        _, radius = self.pupil
+        low = torch.zeros(len(start), self.arms, dtype=torch.float64)
+        high = torch.full_like(low, _FARTHEST * radius)
+        for _ in range(_HALVES):
+            middle = 0.5 * (low + high)
+            passes = self._depth(system, start, middle) > 0.0
+            low, high = torch.where(passes, middle, low), torch.where(passes, high, middle)
+        if bool((low == 0.0).any()):
+            number = int(torch.nonzero((low == 0.0).any(1))[0])
+            raise InputError(f"chart: no light of mark {number + 1} passes the lens")
+        step = _DIFFERENCE * radius
+        ahead, behind = (self._depth(system, start, low + d) for d in (step, -step))
+        return torch.stack([low, (ahead - behind) / (2.0 * step)])
+
+    def landed(
+        self,
+        system: OpticalSystem,
+        pose: Tensor,
+        rims: Tensor,
+        larger: Tensor | float = 0.0,
+        places: Tensor | None = None,
+    ) -> Tensor:
+        """Return rays on the plane of the sensor as designed, and their light.
+
+        Args:
+            system: the lens, whose last vertex the plane's distance counts from.
+            pose: (6,), of the chart.
+            rims: of a lens nearby.
+            larger: by which share marks are larger than the chart says.
+            places: as for `rims`.
+
+        Returns:
+            (5, D, R): x and y, mm; tangents l/n and m/n; and the solid angle of each ray over
+            that of the pupil as designed, seen from the chart's centre.
+        """
+        centres = self._starts(pose, places)[:, None]
+        rho = rims[0] - self._depth(system, centres, rims[0]) / rims[1]
+        nodes, shares = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(self.rings))
+        squares, shares = 0.5 * (nodes + 1.0), 0.5 * shares
+        offsets, parts = self.chart.quadrature()
+        start = self.chart.in_lens_axes(
+            self._places(places)[:, None] + (1.0 + larger) * offsets, pose
+        )
+        reach = rho[..., None] * squares.sqrt()
+        # Marks, points of a mark, arms, rings.
+        ray, light = self._rays(start[:, :, None, None], reach[:, None])
+        area = rho.square()[:, None, :, None] * shares * (parts / self.arms)[:, None, None]
+        light = light * area
+        waves = [self._on_plane(system, ray, nm) for nm in self.wavelengths]
+        every = torch.stack([torch.stack([*found, light / len(waves)]) for found in waves], 1)
+        # (5, waves, D, Q, arms, rings) to (5, D, R).
+        return every.movedim(1, 2).flatten(2)
+
+    def _on_plane(self, system: OpticalSystem, ray: Components, nm: float) -> list[Tensor]:
+        """Return x and y on the plane of the sensor as designed, and tangents."""
+        traced = trace_surfaces(system, ray, nm)
+        landed = trace_to_sensor(system, traced, nm).ray
+        return [landed.x, landed.y, landed.l / landed.n, landed.m / landed.n]
+
+    def _depth(self, system: OpticalSystem, start: Tensor, rho: Tensor) -> Tensor:
+        """Return how far inside all apertures rays from points (D, 1, 3) pass, (D, arms), mm."""
+        ray, _ = self._rays(start, rho)
+        nm = self.lens.primary_wavelength
+        return least_depth(system, trace_surfaces(system, ray, nm, record=True))
+
+    def _rays(self, start: Tensor, rho: Tensor) -> tuple[Components, Tensor]:
+        """Return rays from points (..., 3) to the pupil at radii ρ (D, ..., arms[, rings]).
+
+        Beside them stands cos θ/r² of each, over that along the axis over the pupil's area.
+        """
+        depth, radius = self.pupil
+        angle = torch.arange(self.arms, dtype=torch.float64) + 0.5
+        angle = angle * (2.0 * math.pi / self.arms)
+        # Rings come behind the arms where there are any.
+        if rho.dim() > 2:
+            angle = angle[:, None]
+        x, y = rho * angle.cos(), rho * angle.sin()
+        apart = [x - start[..., 0], y - start[..., 1], depth - start[..., 2] + torch.zeros_like(x)]
+        distance = (apart[0].square() + apart[1].square() + apart[2].square()).sqrt()
+        l, m, n = (a / distance for a in apart)  # noqa: E741
+        x, y, z = (c + torch.zeros_like(n) for c in start.unbind(-1))
+        usual = (self.chart.distance + depth) ** 2 / radius**2
+        return Components(x, y, z, l, m, n), usual * n / distance.square()
+
+    def _places(self, places: Tensor | None) -> Tensor:
+        return self.chart.centres() if places is None else places
+
+    def _starts(self, pose: Tensor, places: Tensor | None) -> Tensor:
+        """Return the marks' centres (D, 3), mm, in the lens's axes."""
+        return self.chart.in_lens_axes(self._places(places), pose)
+
+
+def least_depth(system: OpticalSystem, traced: Trace) -> Tensor:
+    """Return how far inside all apertures rays pass, mm; differentiable.
+
+    It is negative where an aperture clips the ray or where it does not go on.
+
+    Args:
+        system: that the rays went through.
+        traced: with the points where they met its surfaces.
+    """
+    zero = torch.zeros_like(traced.ray.x)
+    found, goes_on = [], torch.ones_like(traced.valid)
+    for surface, axes, point, row in zip(
+        system.surfaces, system.axes, traced.points, traced.margins, strict=True
+    ):
+        x, y = from_lens_axes(Components(*point, zero, zero, zero), axes)[:2]
+        found.append(surface.aperture.depth(x, y))
+        for margin in (row.met, row.transmitted):
+            if margin is not None:
+                goes_on = goes_on & (margin > 0.0)
+    return torch.where(goes_on, torch.stack(found).amin(0), -1.0)
+
 
 # By which share marks are larger than the chart says, and the variance of a Gaussian blur, mm².
 LARGER, BLUR = "mark_size", "blur"

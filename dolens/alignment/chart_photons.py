@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.alignment.chart import DISC, Chart
-from dolens.alignment.mark_windows import MarkWindows
+from dolens.alignment.chart import DISC, Chart, MarkWindows
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays

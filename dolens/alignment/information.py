@@ -8,9 +8,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dolens.alignment.blur import blurred
+from dolens.alignment.gaussian_filters import blurred
+from dolens.alignment.image_losses import deviation, exposure_of, spill_left
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.noise_weighted import deviation, exposure_of, spill_left
 from dolens.alignment.pose import Pose
 from dolens.optics.row_jacobian import forward_columns
 from dolens.rendering.spot_image import SpotImager

@@ -11,20 +11,18 @@ from typing import Annotated
 import typer
 
 from dolens.cli.apply import apply
-from dolens.cli.check import check
 from dolens.cli.compare import compare
-from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
 from dolens.cli.experiments import experiments
 from dolens.cli.export import export
+from dolens.cli.lens_files import check, convert
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
-from dolens.cli.threads import limit_threads
 from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError, one_line
-from dolens.packaged import installed_version
-from dolens.spinning import choose_waiting
+from dolens.files import installed_version
+from dolens.threads import choose_waiting, limit_threads
 
 app = typer.Typer(
     name="dolens",

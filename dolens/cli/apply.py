@@ -5,10 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from dolens.cli.extras import TRUST, import_extra
-from dolens.cli.quiet_logging import quiet_logging
+from dolens.cli.extras import TRUST, import_extra, quiet_logging
 from dolens.errors import InputError, readable
-from dolens.file_text import check_written, resolved_path
+from dolens.files import check_written, resolved_path
 
 
 def apply(

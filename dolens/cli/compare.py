@@ -12,7 +12,7 @@ from rich.table import Table
 
 from dolens.cli.extras import import_extra
 from dolens.errors import InputError
-from dolens.file_text import check_written
+from dolens.files import check_written
 
 _LONGEST_HEADING = 12
 

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from dolens.cli.extras import TRUST, import_extra
-from dolens.cli.quiet_logging import quiet_logging
+from dolens.cli.extras import TRUST, import_extra, quiet_logging
 from dolens.errors import readable
 
 _HEADLINES = {

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dolens.cli.extras import TRUST, import_extra
-from dolens.cli.quiet_logging import quiet_logging
+from dolens.cli.extras import TRUST, import_extra, quiet_logging
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -86,7 +85,7 @@ def export(
     from rich.console import Console
 
     from dolens.errors import InputError, check_choice, readable
-    from dolens.file_text import check_written, resolved_path
+    from dolens.files import check_written, resolved_path
 
     if not 0.0 < sag_nm <= 10.0:
         raise InputError(f"--sag-nm: must be above 0 and at most 10, not {sag_nm:g}")
@@ -113,7 +112,7 @@ def export(
             )
             folder, exported = module.export_run(run_or_lens, out, settings, progress)
         else:
-            from dolens.manufacturing.lens_file_export import export_lens_file
+            from dolens.manufacturing.lens_export import export_lens_file
 
             folder, exported = export_lens_file(
                 run_or_lens, out, formats, tolerances, sag_nm, progress

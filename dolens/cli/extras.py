@@ -1,9 +1,10 @@
-"""Packages that only some commands need."""
+"""What the commands about experiments share: packages that only they need, and a quiet log."""
 
 import importlib
+import logging
 from types import ModuleType
 
-from dolens.errors import InputError
+from dolens.errors import InputError, readable
 
 # What commands that load a run say of their option --trust.
 TRUST = (
@@ -32,3 +33,23 @@ def import_extra(module: str, extra: str, command: str) -> ModuleType:
             f"{command}: the package '{error.name}' is not installed; "
             f"install the packages that it needs by: pip install 'dolens[{extra}]'"
         ) from None
+
+
+class _Printable(logging.Formatter):
+    """Writes out what a terminal would obey: messages quote names that others gave to files."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the lines of a message, each printable."""
+        return "\n".join(map(readable, super().format(record).split("\n")))
+
+
+def quiet_logging() -> None:
+    """Show warnings on the terminal's error stream; files of a log may hold more."""
+    console = logging.StreamHandler()
+    console.setLevel(logging.WARNING)
+    console.setFormatter(_Printable("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[console])
+    # Lightning writes to the terminal by itself; its log goes the way of all others.
+    lightning = logging.getLogger("lightning.pytorch")
+    lightning.handlers.clear()
+    lightning.propagate = True

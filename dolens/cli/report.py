@@ -8,7 +8,7 @@ import typer
 
 from dolens.cli.extras import import_extra
 from dolens.errors import readable
-from dolens.file_text import check_written
+from dolens.files import check_written
 
 _PACKAGE = "dolens.experiments.report"
 # A paragraph a line: the terminal wraps them.

@@ -75,9 +75,8 @@ def show(
     from rich.console import Console
 
     from dolens.errors import InputError
-    from dolens.file_text import check_written
-    from dolens.lens_page.overview import lens_overview
-    from dolens.lens_page.preparation import prepared_lens
+    from dolens.files import check_written
+    from dolens.lens_page.overview import lens_overview, prepared_lens
     from dolens.optics.tables import printable
     from dolens.prescriptions import lens_from_prescription
     from dolens.prescriptions.files import find_lens, read_lens_file, read_yaml_file
@@ -136,7 +135,7 @@ def _field(text: str) -> tuple[float, float]:
 def _check_page(page: Path, lens: Path, force: bool) -> None:
     """Refuse to write a page over something else before work begins."""
     from dolens.errors import InputError
-    from dolens.file_text import check_written
+    from dolens.files import check_written
     from dolens.lens_page import is_page
 
     if page.suffix.lower() not in (".html", ".htm"):

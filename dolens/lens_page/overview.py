@@ -1,16 +1,17 @@
-"""The overview of a lens is its first page: the tables that a terminal shows too."""
+"""The overview of a lens at conditions of one's own: the tables of a page and of a terminal."""
 
-from collections.abc import Callable
+import copy
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
 
-from dolens.analysis.conditions import Conditions, conditions
+from dolens.analysis.conditions import Conditions, conditions, field_points
+from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
 from dolens.analysis.first_order_numbers import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
-from dolens.lens_page.published_table import published_table
-from dolens.lens_page.states_table import states_table
 from dolens.lens_page.tables import (
     Table,
     first_order_table,
@@ -19,8 +20,11 @@ from dolens.lens_page.tables import (
     seidel_table,
     spot_radii_table,
 )
-from dolens.optics.fields import field_label, weights_text
+from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.fields import Fields, field_label, weights_text
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_file_units
+from dolens.optics.published import Published
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.
 _RAYS = 2000
@@ -128,3 +132,157 @@ def _section(title: str, make: Callable[[], Table]) -> TableSection:
         return TableSection(title, [make()])
     except InputError as error:
         return TableSection(title, problems=[str(error)])
+
+
+def prepared_lens(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | None = None,
+    wavelengths: Sequence[float] | None = None,
+    f_number: float | None = None,
+    entrance_pupil_diameter: float | None = None,
+) -> Lens:
+    """Return a copy of a lens, in double precision, with other fields, wavelengths or aperture.
+
+    Args:
+        lens: stays as it is.
+        fields: (x, y) of each: degrees for an object at infinity, else mm on the object.
+        wavelengths: nm; they count alike unless they are the lens's own.  The reference wavelength
+            stays if it is one of them, and else is the middle one in their order.
+        f_number: focal length over the diameter of the entrance pupil, which the stop is set to.
+        entrance_pupil_diameter: mm, instead of an F-number.
+
+    Raises:
+        InputError: a field, wavelength or aperture out of range, or two apertures.
+    """
+    lens = copy.deepcopy(lens).to(device="cpu", dtype=torch.float64).requires_grad_(False)
+    if wavelengths is not None:
+        waves = as_wavelengths(wavelengths).tolist()
+        if len(set(waves)) < len(waves):
+            raise InputError(f"wavelengths: one is given twice, {waves}")
+        # Its own wavelengths keep their weights; others count alike.
+        shares = spectral_shares(lens, waves)
+        weighted = lens.wavelength_weights is not None
+        lens.wavelength_weights = tuple(shares.tolist()) if weighted else None
+        lens.wavelengths = tuple(waves)
+        if lens.reference_wavelength not in waves:
+            lens.reference_wavelength = waves[(len(waves) - 1) // 2]
+    if fields is not None:
+        points = field_points(fields)
+        finite = lens.object_distance is not None and math.isfinite(lens.object_distance)
+        if not finite and not bool((points.abs() < 90.0).all()):
+            raise InputError(f"fields must be within ±90 degrees, not {points.tolist()}")
+        kind = "heights" if finite else "angles"
+        lens.fields = Fields(kind, tuple((x, y) for x, y in points.tolist()))
+    return with_aperture(lens, f_number, entrance_pupil_diameter)
+
+
+# Attribute of `Published` → name of the quantity and its unit.
+_ROWS = {
+    "efl": ("effective focal length", "mm"),
+    "f_number": ("F-number", ""),
+    "na": ("numerical aperture, image", ""),
+    "object_na": ("numerical aperture, object", ""),
+    "entrance_pupil_diameter": ("entrance pupil diameter", "mm"),
+    "half_field": ("half field", "°"),
+    "image_height": ("image height", "mm"),
+    "object_height": ("object height", "mm"),
+    "bfd": ("back focal distance", "mm"),
+    "length": ("length of the lens", "mm"),
+    "track": ("total track", "mm"),
+    "magnification": ("magnification", ""),
+}
+
+
+@torch.no_grad()
+def published_table(lens: Lens, where: Conditions) -> Table:
+    """Return the published numbers of a lens, and the same quantities computed at its conditions.
+
+    Fields are not computed: the fields of the lens are those that it is used with.  The focal
+    length is compared without its sign, which is negative behind an intermediate image.
+
+    Args:
+        lens: a lens whose `published` is not None.
+        where: its conditions.
+    """
+    published = lens.published or Published()
+    found = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
+    computed = {
+        "efl": abs(found.efl),
+        "f_number": abs(found.f_number),
+        "na": abs(0.5 / found.working_f_number),
+        "entrance_pupil_diameter": found.entrance_pupil_diameter,
+        "bfd": found.bfd,
+        "length": found.length,
+        "track": found.total_track,
+        "magnification": found.magnification,
+    }
+    if where.object_distance is not None:
+        # The paraxial marginal ray has n·u = m·n'·u'; the aperture is a sine.
+        n = float(lens.materials[0].index(where.reference_wavelength))
+        slope = abs(found.magnification * computed["na"]) / n
+        computed["object_na"] = n * math.sin(math.atan(slope))
+    rows = []
+    for key, (name, unit) in _ROWS.items():
+        value = getattr(published, key)
+        if value is None:
+            continue
+        said = number(value, 7)
+        if key == "efl" and published.efl_tolerance is not None:
+            said += f" ± {number(published.efl_tolerance, 3)}"
+        rows.append((name, said, number(computed[key], 7) if key in computed else "", unit))
+    parts = [published.kind, lens.source, published.note]
+    caption = ". ".join(part.strip().rstrip(".") for part in parts if part)
+    return Table(
+        ("quantity", "published", "computed", "unit"),
+        rows,
+        caption[:1].upper() + caption[1:] + "." if caption else "",
+        frozenset({0, 3}),
+    )
+
+
+@torch.no_grad()
+def states_table(lens: Lens) -> Table:
+    """Return a column for every state: focal length, F-number, edge of the field, object distance,
+    track, temperature, and the parameters that any state has for itself.
+
+    Args:
+        lens: with states.
+
+    Raises:
+        InputError: a state's conditions are none that an analysis can take; the message names it.
+    """
+    own = dict.fromkeys(
+        base for name in lens.state_names for base, _ in lens.states[name].named_parameters()
+    )
+    shown = [base for base in own if lens.get_parameter(base).ndim == 0]
+    columns = []
+    for name in lens.state_names:
+        there = lens.in_state(name)
+        try:
+            where = conditions(there)
+        except InputError as error:
+            raise InputError(f"state '{name}': {error}") from None
+        first = first_order_numbers(there, where.reference_wavelength, where.object_distance)
+        edge = max(math.hypot(*point) for point in where.fields.tolist())
+        distance = math.inf if where.object_distance is None else where.object_distance
+        efl = None if there.published is None else there.published.efl
+        values = [to_file_units(base, float(there.get_parameter(base))) for base in shown]
+        columns.append(
+            (
+                " × ".join(number(own.efl) for own in first.sections or (first,)),
+                "" if efl is None else number(efl),
+                number(abs(first.working_f_number), 3),
+                f"{number(edge)}{where.field_unit}",
+                number(distance),
+                number(first.total_track),
+                "" if there.temperature is None else number(there.temperature),
+                *map(number, values),
+            )
+        )
+    heads = ("EFL (mm)", "published", "F/#", "field", "object (mm)", "track (mm)", "T (°C)", *shown)
+    rows = zip(heads, *columns, strict=True)
+    return Table(
+        ("state", *lens.state_names),
+        [row for row in rows if any(row[1:])],
+        "The working F-number, and what states have for themselves (mm, degrees)",
+    )

@@ -10,20 +10,20 @@ import torch
 
 from dolens.errors import InputError
 from dolens.html import Child, Markup, joined
-from dolens.lens_page.content import Content, Section
-from dolens.lens_page.inline_svg import holds_pictures, inline_svg, rasterise
 from dolens.lens_page.markup import (
     GENERATOR,
     Block,
     figure_html,
+    holds_pictures,
+    inline_svg,
     note_html,
     page_html,
     problem_html,
+    rasterise,
     table_html,
 )
-from dolens.lens_page.overview import Overview, lens_overview
-from dolens.lens_page.preparation import prepared_lens
-from dolens.lens_page.sections import PageSections
+from dolens.lens_page.overview import Overview, lens_overview, prepared_lens
+from dolens.lens_page.sections import Content, PageSections, Section
 from dolens.lens_page.tables import number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens

@@ -1,23 +1,20 @@
-"""The sections of a page: what each shows, and how it is computed.
+"""The sections of a page about a lens: what each shows, and how it is computed.
 
 Every section is computed alone, so that one that fails leaves the others.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
+import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.analysis.conditions import (
-    FieldScan,
-    field_scans,
-    spectral_lines,
-    wavelength_interval,
-)
+from dolens.analysis.conditions import FieldScan, field_scans, spectral_lines, wavelength_interval
 from dolens.analysis.encircled_energy import encircled_energy
-from dolens.analysis.field_curves import field_curves
+from dolens.analysis.field_curves import DISTORTION_REFERENCES, field_curves, image_displacement
 from dolens.analysis.footprint import footprint
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
@@ -26,21 +23,17 @@ from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.diffraction.illumination import relative_illumination
 from dolens.diffraction.point_spread import PointSpread, diffraction_encircled_energy, point_spread
 from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
+from dolens.diffraction.strehl import marechal
 from dolens.diffraction.transfer import diffraction_modulation
-from dolens.diffraction.wavefront_error import wavefront_errors
-from dolens.diffraction.wavefront_map import wavefront_maps
+from dolens.diffraction.wavefront_error import WavefrontErrors, wavefront_errors
+from dolens.diffraction.wavefront_map import WavefrontMaps, wavefront_maps
 from dolens.errors import InputError
-from dolens.lens_page.content import Content, Section
+from dolens.html import Markup
+from dolens.lens_page.markup import viewer_html
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.viewer import viewer_html
-from dolens.lens_page.wavefront_tables import (
-    distortion_table,
-    errors_table,
-    sampling_note,
-    zernike_table,
-)
+from dolens.lens_page.tables import Table, number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.encircled_energy import encircled_energy_figure
@@ -56,6 +49,41 @@ from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
 from dolens.plotting.states import states_layout_figure
 from dolens.plotting.wavefront_maps import wavefront_maps_figure
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a section shows.
+
+    Attributes:
+        figures: file name without suffix → figure.
+        tables: below the figures.
+        note: a sentence above them.
+        html: elements above them.
+        problems: what could not be computed, and why, a sentence each.
+    """
+
+    figures: dict[str, Figure] = field(default_factory=dict)
+    tables: list[Table] = field(default_factory=list)
+    note: str = ""
+    html: Markup | None = None
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page.
+
+    Attributes:
+        name: in addresses within the page.
+        title: its heading.
+        make: computes what it shows.
+    """
+
+    name: str
+    title: str
+    make: Callable[[], Content]
+
 
 # Of each field and wavelength.
 _MTF_RAYS, _RMS_RAYS, _FOOTPRINT_RAYS = 6000, 2000, 400
@@ -291,3 +319,78 @@ class PageSections:
             " ".join([*found.notes, found.summary()]),
             problems=problems,
         )
+
+
+# Fringe terms up to secondary spherical, without piston.
+_TERMS = 16
+# Every so manieth field of a scan.
+_SOME = 8
+
+
+def errors_table(errors: WavefrontErrors) -> Table:
+    """Return RMS, peak to valley and Strehl ratio of every field and wavelength."""
+    columns = (
+        *(errors.rms, errors.peak_to_valley, errors.strehl_ratio),
+        marechal(errors.rms),
+    )
+    rows = [
+        (
+            field_label(point, errors.field_unit),
+            f"{wave:g}",
+            *(number(values[row, column], 3) for values in columns),
+        )
+        for row, point in enumerate(errors.fields)
+        for column, wave in enumerate(errors.wavelengths.tolist())
+    ]
+    return Table(
+        (
+            *("field", "wavelength (nm)", "RMS (waves)", "peak to valley (waves)"),
+            *("Strehl ratio", "by Maréchal"),
+        ),
+        rows,
+        "On the sensor as it stands, tilt removed; Maréchal's ratio is exp(−(2π·RMS)²). – : no "
+        "light passes.",
+    )
+
+
+def zernike_table(maps: WavefrontMaps) -> Table:
+    """Return fringe coefficients of the maps' first wavelength, a column a field."""
+    fit = maps.zernike("fringe")
+    fields = [field_label(field, maps.field_unit) for field in maps.fields]
+    rows = [
+        (f"Z{n + 1}", fit.names[n], *(number(c, 3) for c in fit.coefficients[:, 0, n]))
+        for n in range(1, _TERMS)
+    ]
+    rows.append(("", "RMS beyond 37 terms", *(number(r, 2) for r in fit.residual_rms[:, 0])))
+    return Table(
+        ("fringe", "term", *fields),
+        rows,
+        "Zernike coefficients in waves, over the disc of the stop; over a vignetted or obscured "
+        "pupil they are a fit, whose terms are not orthogonal.",
+        frozenset({0, 1}),
+    )
+
+
+def distortion_table(lens: Lens, scans: Sequence[FieldScan]) -> Table:
+    """Return distortion from f·tan θ and from f·θ at some fields of the first scan."""
+    scan = scans[0]
+    some = torch.arange(len(scan.fields) - 1, 0, -_SOME).flip(0)
+    some = some[scan.coordinate[some] != 0.0]
+    columns = [
+        image_displacement(lens, scan, [lens.primary_wavelength], None, name).distortion[some, 0]
+        for name in DISTORTION_REFERENCES
+    ]
+    rows = [
+        (field_label(scan.fields[at], scan.field_unit), *(number(c[row], 3) for c in columns))
+        for row, at in enumerate(some.tolist())
+    ]
+    heads = [f"from {text} (%)" for text in DISTORTION_REFERENCES.values()]
+    return Table(("field", *heads), rows, "Distortion of the reference wavelength's chief ray.")
+
+
+def sampling_note(what: str, errors: Tensor) -> str:
+    """Return a sentence about the largest sampling error; nothing where none is known."""
+    known = errors[errors.isfinite()]
+    if not len(known):
+        return ""
+    return f"Sampling error of the {what}: {number(known.max(), 2)} or less, by a second sampling."

@@ -1,16 +1,22 @@
-"""Designs are what the steps of a search hand on: many lenses of one arrangement."""
+"""Designs are many lenses of one arrangement; the best of them become lenses of their own."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import STOP, Arrangement
+from dolens.lens_search.arrangement import AIR, STOP, Arrangement, asphere
 from dolens.lens_search.form_coordinates import ZONES, FormArrays, departures, form_coordinates
 from dolens.lens_search.forms import TOLERANCE, form_numbers
+from dolens.lens_search.glass.glass_merit import with_glasses_of
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import LensNumbers
+from dolens.lens_search.real_pupils import stop_radii, with_real_beams
+from dolens.lens_search.specification import Specification
+from dolens.optics.lens import Lens
+from dolens.prescriptions.build import lens_from_prescription
 
 
 @dataclass(frozen=True)
@@ -166,3 +172,134 @@ def element_powers(arrangement: Arrangement, values: Tensor, merit: SearchMerit)
             bend = curvatures[:, surface] - curvatures[:, surface + 1]
             powers.append((indices[surface + 1] - 1.0) * bend)
     return torch.stack(powers, -1)
+
+
+Pool = dict[Arrangement, Designs]
+
+
+def best_forms(pool: Pool, count: int) -> list[Designs]:
+    """Return that many of the best forms of all arrangements, one each."""
+    ranked = list(_ranked(pool))[:count]
+    return [pool[arrangement].chosen(torch.tensor([row])) for arrangement, row in ranked]
+
+
+def parents_of(pool: Pool, count: int, tried: dict[Arrangement, Tensor]) -> list[Designs]:
+    """Return the best forms of all arrangements that have not been parents yet, and note them.
+
+    Args:
+        pool: all forms.
+        count: of parents.
+        tried: u of those that have been parents.
+    """
+    rows: dict[Arrangement, list[int]] = {}
+    left = count
+    for arrangement, row in _ranked(pool):
+        if arrangement.within:  # elements around a stop in glass cannot be taken apart
+            continue
+        values = pool[arrangement].values[row]
+        before = tried.get(arrangement)
+        if before is not None and bool((before - values).abs().amax(-1).lt(1e-3).any()):
+            continue
+        rows.setdefault(arrangement, []).append(row)
+        left -= 1
+        if left == 0:
+            break
+    found = []
+    for arrangement, chosen in rows.items():
+        designs = pool[arrangement].chosen(torch.tensor(chosen))
+        before = tried.get(arrangement)
+        tried[arrangement] = (
+            designs.values if before is None else torch.cat([before, designs.values])
+        )
+        found.append(designs)
+    return found
+
+
+def shares(designs: Designs, size: int = 4) -> Sequence[Designs]:
+    """Return designs in parts, a task each."""
+    rows = torch.arange(len(designs.values))
+    return [designs.chosen(part) for part in rows.split(size)]
+
+
+def _ranked(pool: Pool) -> Iterator[tuple[Arrangement, int]]:
+    """Yield the arrangement and the row of each form, the best first."""
+    ranked = sorted(
+        (float(merit), arrangement.stop, arrangement.within, row, arrangement)
+        for arrangement, designs in pool.items()
+        for row, merit in enumerate(designs.merit)
+    )
+    for *_, row, arrangement in ranked:
+        yield arrangement, row
+
+
+# Edges of elements over the height of the beam.  A polynomial may turn steeply where no ray passes,
+# and where light may be vignetted the edges are what clips it.
+_MARGIN, _TIGHT = 1.05, 1.005
+
+
+def designed_lens(
+    arrangement: Arrangement, specification: Specification, values: Tensor, name: str
+) -> Lens:
+    """Return a design as a lens with a stop that limits the beam, fields and wavelengths.
+
+    The stop's semi-diameter is that of the axial beam at the reference wavelength, by a real ray.
+    Other apertures pass the whole beam with some room.
+
+    Args:
+        arrangement: the order of its elements.
+        specification: what it is for.
+        values: u, (P,).
+        name: of the lens.
+    """
+    specification = with_glasses_of(arrangement, specification, values)
+    values = values[: arrangement.variables]
+    f = specification.focal_length
+    merit = SearchMerit.of(arrangement, specification, 1, 1)
+    numbers, found = merit.first_order(values[None])
+    radius = 0.5 * f / specification.f_number
+    field = max(float(t) for t in merit.rays.tangent) * f
+    zero = torch.zeros(1, dtype=torch.float64)
+    conditions = with_real_beams(merit, values[None], merit.full(1))
+    stop_radius = float(stop_radii(merit, values[None], conditions)) * f
+    surfaces: dict[str, dict[str, Any]] = {}
+    gaps = [*(float(gap) * f for gap in numbers.gaps), None]
+    media = [*arrangement.gap_media, AIR]
+    for place, number in enumerate(arrangement.sequence):
+        row: dict[str, Any] = {"type": "aperture"}
+        if number == STOP:
+            row["semi_diameter"] = stop_radius
+        else:
+            curvature = float(numbers.curvatures[number]) / f
+            height = abs(float(found.marginal[number] + zero)) * radius
+            height += abs(float(found.chief[number] + zero)) * field
+            height *= float(conditions.beam[0, number])
+            row, margin = {"type": "plane"}, _TIGHT if specification.vignetting else _MARGIN
+            if arrangement.is_asphere(number):
+                margin = _TIGHT
+                terms = enumerate(numbers.coefficients[number])
+                row = asphere(
+                    curvature or 1e-12 / f, [float(a) / f ** (2 * n + 3) for n, a in terms]
+                )
+            elif curvature != 0.0:
+                row = {"type": "sphere", "radius": 1.0 / curvature}
+                height = min(height, 0.99 / abs(curvature) / margin)
+            row["semi_diameter"] = margin * height
+        if gaps[place] is not None:
+            row["thickness"] = gaps[place]
+        medium = media[place]
+        row["material"] = "air" if medium == AIR else specification.element_glasses[medium]
+        surfaces[str(place + 1)] = row
+    image = float(numbers.image) * f
+    return lens_from_prescription(
+        {
+            "name": name,
+            "stop": arrangement.stop_place + 1,
+            "wavelengths": list(specification.wavelengths),
+            "reference_wavelength": specification.wavelengths[specification.reference],
+            "fields": {"angles": [[0.0, float(angle)] for angle in specification.fields]},
+            "surfaces": surfaces,
+            "sensor": {"distance": image, "diameter": 2.2 * field},
+        },
+        dtype=torch.float64,
+        where=name,
+    )

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.lens_search.conditions import Conditions
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.real_pupils import with_real_beams
+from dolens.lens_search.search_rays import Conditions
 from dolens.optimize.batch_least_squares import BatchModel, BatchResult, minimise_batch
 
 

@@ -12,15 +12,17 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import Arrangement, parameter_names, template
-from dolens.lens_search.chief_rays import chief_ray_angles, distortion
-from dolens.lens_search.conditions import Conditions, paraxial_pupils
-from dolens.lens_search.operands import paraxial_operands
-from dolens.lens_search.paraxial import LensNumbers, Paraxial, numbers_of, paraxial
-from dolens.lens_search.search_rays import SearchRays, launched, search_rays
+from dolens.lens_search.arrangement import Arrangement, parameter_names, template, variable_bounds
+from dolens.lens_search.operands import chief_ray_angles, distortion, paraxial_operands
+from dolens.lens_search.paraxial import LensNumbers, Paraxial, Tangents, numbers_of, paraxial
+from dolens.lens_search.search_rays import (
+    Conditions,
+    SearchRays,
+    launched,
+    paraxial_pupils,
+    search_rays,
+)
 from dolens.lens_search.specification import Specification
-from dolens.lens_search.tangents import Tangents
-from dolens.lens_search.variable_bounds import variable_bounds
 from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
 from dolens.optimize.batch_least_squares import BatchModel
 

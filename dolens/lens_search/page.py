@@ -4,19 +4,19 @@ It is one HTML file that needs no network; the prescriptions that it links to li
 """
 
 import math
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
 from dolens.html import Child, Markup, element, joined, table
-from dolens.lens_page.inline_svg import inline_svg
-from dolens.lens_page.markup import Block, figure_html, page_html, problem_html
+from dolens.lens_page.markup import Block, figure_html, inline_svg, page_html, problem_html
 from dolens.lens_page.tables import number
-from dolens.lens_search.file_table import address, file_table
 from dolens.lens_search.form_report import FormReport
-from dolens.lens_search.page_style import STYLE
 from dolens.lens_search.verification import Check
 from dolens.optics.fields import field_label
 from dolens.plotting.export import laid_out
@@ -265,3 +265,74 @@ def _cell(check: Check | None) -> Markup:
     # What rounding leaves of zero is zero.
     value = 0.0 if abs(check.value) < 1e-9 else check.value
     return element("span", number(value, 4), class_=kind, title=check.place or None)
+
+
+_MISSING = "✗ not written"
+# A number in a sentence.
+_NUMBER = re.compile(r"-?\d+\.\d+(e[-+]?\d+)?")
+
+
+def address(path: Path, folder: Path) -> str:
+    """Return where a file lies, seen from a page in a folder."""
+    return quote(Path(os.path.relpath(path, folder)).as_posix())
+
+
+def file_table(reports: Sequence[FormReport], folder: Path) -> Markup:
+    """Return which formats hold each form, and what those say otherwise that cannot hold all."""
+    suffixes = [file.path.suffix for file in reports[0].files]
+    rows: list[list[Child]] = []
+    # A change that only differs in its number is one.
+    notes: dict[str, dict[int, str]] = {}
+    for report in reports:
+        row: list[Child] = [report.name]
+        for file in report.files:
+            if not file.written:
+                row.append(element("span", _MISSING, class_="bad"))
+            else:
+                mark = "" if file.exact else " ≈"
+                name = f"{file.path.suffix}{mark}"
+                row.append(element("a", name, href=address(file.path, folder)))
+            for change in file.changes:
+                note = f"{file.path.suffix}: {change}"
+                notes.setdefault(_NUMBER.sub("…", note), {})[report.number] = note
+        rows.append(row)
+    kinds = dict.fromkeys(range(len(suffixes) + 1), "words")
+    said = []
+    for general, of in notes.items():
+        alike = set(of.values())
+        where = "" if len(of) == len(reports) else f" (form {', '.join(map(str, of))})"
+        said.append(element("li", (alike.pop() if len(alike) == 1 else general) + where))
+    caption = "Every file was read again: it gives the same numbers to the last bit, but for ≈."
+    return joined(
+        element("div", table(("form", *suffixes), rows, column_kinds=kinds), class_="scroll"),
+        element("p", caption, class_="caption"),
+        element("ul", *said, class_="notes") if said else None,
+    )
+
+
+STYLE = """
+:root { --good: #1a7f4b; --bad: #b3261e; }
+@media (prefers-color-scheme: dark) { :root { --good: #63c993; --bad: #ff8a80; } }
+.page { grid-template-columns: 11rem minmax(0, 90rem); max-width: 106rem; }
+.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(21rem, 1fr)); gap: 1rem; }
+.card { display: flex; flex-direction: column; border: 1px solid var(--line); border-radius: .5rem;
+  padding: .7rem .9rem; min-width: 0; scroll-margin-top: 1rem; }
+.card:target { border-color: var(--accent); }
+.card h3 { display: flex; flex-wrap: wrap; gap: .2rem .8rem; align-items: baseline;
+  margin: 0 0 .6rem; color: var(--ink); font-weight: 400; }
+.card h3 b { font-size: 1.15rem; font-weight: 650; }
+.card .powers { font-variant-numeric: tabular-nums; letter-spacing: .06em; }
+.card figure { margin-top: auto; }
+.card figure svg { max-width: none !important; }
+.card .bar { border-top: 2px solid currentColor; font-size: .75rem; color: var(--soft);
+  margin: .3rem 0 .5rem; padding-top: .1rem; white-space: nowrap; }
+.card dl { display: grid; grid-template-columns: auto 1fr; gap: .05rem .8rem; margin: 0;
+  font-size: .85rem; font-variant-numeric: tabular-nums; }
+.card dt { color: var(--soft); }
+.card dd { margin: 0; overflow-wrap: anywhere; }
+.links { display: flex; gap: .7rem; margin: .5rem 0 0; font-size: .85rem; }
+.good { color: var(--good); } .bad { color: var(--bad); font-weight: 600; }
+a { color: var(--accent); }
+.notes { color: var(--soft); font-size: .85rem; padding-left: 1.1rem; }
+@media (max-width: 60rem) { .page { grid-template-columns: minmax(0, 1fr); } }
+"""

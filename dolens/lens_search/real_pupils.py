@@ -16,9 +16,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.lens_search.conditions import Conditions, beam_heights
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.search_rays import launched, through_points
+from dolens.lens_search.search_rays import Conditions, beam_heights, launched, through_points
 from dolens.optics.lens_family import FamilyRays
 
 # Of the beam at the stop, in its half axes: the middle, and the rim above, below, at the side and

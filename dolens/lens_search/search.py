@@ -14,16 +14,13 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.designs import Designs, element_powers
-from dolens.lens_search.glass.glass_merit import GlassMerit
+from dolens.lens_search.designs import Designs, best_forms, element_powers, parents_of, shares
+from dolens.lens_search.glass.glass_merit import GlassMerit, merit_of
 from dolens.lens_search.glass.glass_step import GlassPlan, with_real_glasses
 from dolens.lens_search.growth import STAGES, Grown, Stage, finish, grow
-from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.neighbours import inserted, taken_out
-from dolens.lens_search.parents import best_forms, parents_of, shares
 from dolens.lens_search.specification import Specification
-from dolens.lens_search.starts import DRAWN, random_starts
+from dolens.lens_search.starts import DRAWN, inserted, random_starts, taken_out
 from dolens.tasks import TaskMap
 
 

@@ -1,19 +1,25 @@
-"""A lens is exported: its design, solids and drawings, with what each file is and how exact."""
+"""A lens is exported: its design, solids and drawings, and a record of what each file is."""
 
+import datetime
+import hashlib
+import json
+import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError, check_choice
+from dolens.files import installed_version
 from dolens.manufacturing.drawings import export_drawings
-from dolens.manufacturing.shop_tolerances import ShopTolerances
-from dolens.manufacturing.solids_picture import solids_figure
+from dolens.manufacturing.shop_tolerances import ShopTolerances, read_tolerances
+from dolens.manufacturing.solids import solids_figure
 from dolens.manufacturing.step import TOLERANCE_NM, StepResult, export_step
 from dolens.optics.lens import Lens
 from dolens.plotting.captions import plain_text
 from dolens.plotting.export import save_figure
-from dolens.prescriptions.files import save_lens
+from dolens.prescriptions.build import prescription_of
+from dolens.prescriptions.files import load_lens, save_lens
 
 FORMATS = ("yaml", "zmx", "step", "drawing")
 
@@ -140,3 +146,101 @@ def _drawings(
     }
     for path in result.sheets:
         exported.files[f"drawing/{path.name}"] = {"is": "the same sheet as SVG"}
+
+
+def export_lens_file(
+    file: str | Path,
+    folder: str | Path | None = None,
+    formats: Sequence[str] = FORMATS,
+    tolerances: str | None = None,
+    tolerance_nm: float = TOLERANCE_NM,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Path, Exported]:
+    """Export a lens file; see `export_lens`.
+
+    Args:
+        file: of the lens, or the name of a lens of dolens.
+        folder: for the files; None: the lens's name and `_export` in the working folder.
+        formats: of `FORMATS`.
+        tolerances: a file of tolerances for the drawings; None: all are to be agreed.
+        tolerance_nm: the largest error in sag of the STEP file.
+        progress: called with the name of each format before it is written.
+
+    Returns:
+        The folder, and what is in it.
+
+    Raises:
+        InputError: the lens or the tolerances cannot be read, or an unknown format.
+    """
+    lens = load_lens(file).requires_grad_(False)
+    drawn, known = lens, ShopTolerances()
+    if tolerances is not None:
+        drawn, known = read_tolerances(lens, tolerances)
+    folder = Path(f"{Path(file).stem}_export") if folder is None else Path(folder)
+    design = design_hash(lens)
+    exported = export_lens(
+        lens, folder, formats, known, design, program_name(), tolerance_nm, progress, drawn
+    )
+    write_record(folder, lens, exported, {"lens": Path(file).name})
+    return folder, exported
+
+
+RECORD = "export.json"
+_PACKAGES = (
+    *("dolens", "numpy", "scipy", "torch", "matplotlib", "cadquery-ocp-novtk"),
+    *("onnx", "onnxscript", "onnxruntime"),
+)
+
+
+def program_name() -> str:
+    """Return `dolens` and its version."""
+    return f"dolens {installed_version('dolens') or ''}".strip()
+
+
+def write_record(
+    folder: str | Path, lens: Lens, exported: Exported, source: dict[str, Any]
+) -> Path:
+    """Write export.json, and return its path.
+
+    Args:
+        folder: of the export.
+        lens: that was exported.
+        exported: what was written.
+        source: where the lens is from: plain values.
+    """
+    folder = Path(folder)
+    files = {
+        name: {**facts, "bytes": (folder / name).stat().st_size, "sha256": file_hash(folder / name)}
+        for name, facts in exported.files.items()
+    }
+    record = {
+        "lens": lens.name,
+        "source": source,
+        "design_sha256": design_hash(lens),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "files": files,
+        "not_written": exported.refused,
+        "notes": exported.notes,
+        "versions": {
+            "python": platform.python_version(),
+            **{
+                name: version
+                for name in _PACKAGES
+                if (version := installed_version(name)) is not None
+            },
+        },
+    }
+    path = folder / RECORD
+    path.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return path
+
+
+def design_hash(lens: Lens) -> str:
+    """Return the SHA-256 of a lens's prescription: equal for the same numbers, to the last bit."""
+    text = json.dumps(prescription_of(lens), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_hash(path: str | Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()

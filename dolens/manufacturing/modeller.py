@@ -1,18 +1,276 @@
-"""The solid modeller Open CASCADE, which the extra `cad` installs, and its small vocabulary here.
+"""The solid modeller Open CASCADE, and surfaces as the lines, arcs and splines that it has.
 
-Its Python package `OCP` is imported when a solid is first wanted, and nowhere else.
+Its Python package `OCP`, which the extra `cad` installs, is imported when a solid is first
+wanted, and nowhere else.  Of a surface of revolution the meridian is a curve: a plane is a line
+and a sphere an arc, exactly.  Any other conic is a rational quadratic Bézier arc, exactly too.
+Everything else is a cubic spline through the sag.  A surface without an axis of symmetry is a
+tensor product of cubic splines over a rectangle.
 """
 
 import importlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import BSpline as ScipySpline
+from scipy.interpolate import make_interp_spline
 
 from dolens.errors import InputError
-from dolens.manufacturing.freeform import TensorSpline
-from dolens.manufacturing.meridians import Arc, Line, Meridian
+from dolens.manufacturing.glass_elements import Face
+from dolens.optics.surfaces.b_spline import BSpline
+from dolens.optics.surfaces.conic import Conic
+
+# A spline is refined until it is this share of the tolerance from the sag.
+_SHARE = 0.1
+_FIRST_SPANS = 16
+_MOST_SPANS = 4096
+# Points within each span at which a fit is looked at; none of them is a knot.
+# Share of the reach at which the slope at the vertex is taken.
+_BESIDE = 1e-12
+_BETWEEN = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
+# Arcs of larger radii are Bézier arcs: a centre 10 km away would cost the vertex its last digits.
+_LARGEST_RADIUS = 1e7
+
+
+@dataclass(frozen=True)
+class Line:
+    """The meridian is straight: from the vertex to (r, 0), mm."""
+
+    radius: float
+
+
+@dataclass(frozen=True)
+class Arc:
+    """The meridian is an arc of a circle from the vertex.
+
+    Attributes:
+        radius: mm, signed: positive where the centre lies towards +z.
+        angle: radians, that the arc spans, up to π/2.
+    """
+
+    radius: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class Spline:
+    """The meridian is a spline from the vertex to the rim.
+
+    Attributes:
+        degree: of its polynomials.
+        knots: distinct ones, in order.
+        multiplicities: of the knots.
+        poles: (n, 2), r and z, mm.
+        weights: (n,), of a rational one, or None.
+    """
+
+    degree: int
+    knots: np.ndarray
+    multiplicities: np.ndarray
+    poles: np.ndarray
+    weights: np.ndarray | None = None
+
+
+Meridian = Line | Arc | Spline
+
+
+def meridian(face: Face, reach: float, tolerance: float) -> Meridian:
+    """Return the curve of a surface of revolution from the vertex out to `reach`.
+
+    Args:
+        face: of a shape with rotational symmetry.
+        reach: mm from the axis.
+        tolerance: mm, that the curve may be off in sag.
+
+    Raises:
+        InputError: no spline of reasonable size comes within the tolerance, or the sag ends before
+            `reach`.
+    """
+    if face.flat:
+        return Line(reach)
+    rim = float(face.sag(np.array(reach), np.array(0.0)))
+    if not np.isfinite(rim):
+        raise InputError(f"surface {face.number} has no sag at {reach:g} mm from the axis")
+    if _is_conic(face):
+        c = float(face.parameters["curvature"])
+        k = float(face.parameters.get("conic", 0.0))
+        if k == 0.0 and abs(1.0 / c) < _LARGEST_RADIUS:
+            return Arc(1.0 / c, float(np.arcsin(min(1.0, abs(c) * reach))))
+        return conic_arc(c, k, reach)
+    return spline_meridian(face, reach, tolerance)
+
+
+def conic_arc(c: float, k: float, reach: float) -> Spline:
+    """Return a conic's meridian r² - 2Rz + (1+k)z² = 0 as a rational quadratic Bézier arc.
+
+    Its ends are the vertex P0 and the rim P2, its middle pole P1 where the tangents there meet.
+    With M = (P0 + P2)/2 and F the conic's quadratic form in homogeneous coordinates, P1 is the
+    pole of the chord through M, so F(M + w·P1) = F(M) + w²·F(P1), which is zero for the weight
+    w = √(-F(M)/F(P1)).
+
+    Args:
+        c: curvature 1/R, 1/mm; not zero.
+        k: conic constant.
+        reach: mm from the axis, on the sag branch.
+    """
+    root = np.sqrt(max(0.0, 1.0 - (1.0 + k) * c * c * reach * reach))
+    z = c * reach * reach / (1.0 + root)
+    # The tangent at the rim has the slope c·r/root, so it reaches z = 0 at r - z·root/(c·r).
+    pole = reach - z * root / (c * reach)
+
+    def form(x: float, y: float) -> float:
+        return c * x * x - 2.0 * y + (1.0 + k) * c * y * y
+
+    weight = np.sqrt(-form(0.5 * reach, 0.5 * z) / (c * pole * pole))
+    return Spline(
+        2,
+        np.array([0.0, 1.0]),
+        np.array([3, 3]),
+        np.array([[0.0, 0.0], [pole, 0.0], [reach, z]]),
+        np.array([1.0, weight, 1.0]),
+    )
+
+
+def spline_meridian(face: Face, reach: float, tolerance: float) -> Spline:
+    """Return a cubic spline through the sag, with its slopes at vertex and rim.
+
+    Its parameter is the distance from the axis.  The number of spans doubles until the spline is
+    within a tenth of the tolerance between its knots.
+    """
+    spans = _FIRST_SPANS
+    while spans <= _MOST_SPANS:
+        r = np.linspace(0.0, reach, spans + 1)
+        sag = face.sag(r, np.zeros_like(r))
+        # The vertex itself may be a cusp (an axicon's): its slope is that beside it.
+        beside = np.maximum(r, _BESIDE * reach)
+        slope = face.sag_and_slopes(beside, np.zeros_like(r))[1]
+        spline = make_interp_spline(
+            r, sag, k=3, bc_type=([(1, float(slope[0]))], [(1, float(slope[-1]))])
+        )
+        between = (np.arange(spans)[:, None] + np.array(_BETWEEN)).ravel() * (reach / spans)
+        error = np.abs(spline(between) - face.sag(between, np.zeros_like(between))).max()
+        if error <= _SHARE * tolerance:
+            knots, multiplicities = np.unique(spline.t, return_counts=True)
+            poles = np.stack([greville(spline.t), spline.c], -1)
+            return Spline(3, knots, multiplicities, poles)
+        spans *= 2
+    raise InputError(
+        f"surface {face.number}: no spline of up to {_MOST_SPANS} spans follows its sag to "
+        f"{1e6 * tolerance:g} nm (the last one was off by {1e6 * error:.3g} nm)"
+    )
+
+
+def greville(knots: np.ndarray, degree: int = 3) -> np.ndarray:
+    """Return Σ t_(i+1…i+degree)/degree: the coefficients of the spline that is the identity."""
+    count = len(knots) - degree - 1
+    return np.stack([knots[1 + j : 1 + j + count] for j in range(degree)]).mean(0)
+
+
+def _is_conic(face: Face) -> bool:
+    """Return whether a surface is a conic of revolution: a4, a6, … are absent or zero."""
+    further = (p for name, p in face.parameters.items() if name not in ("curvature", "conic"))
+    return issubclass(face.shape, Conic) and all(float(p) == 0.0 for p in further)
+
+
+_SHARE_OF_TOLERANCE = 0.1
+_FIRST_SPANS_ACROSS = 4
+_MOST_SPANS_ACROSS = 256
+_BETWEEN_KNOTS = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
+
+
+@dataclass(frozen=True)
+class TensorSpline:
+    """z(x, y) = Σ c_ij·N_i(x)·N_j(y) with cubic B-splines N.
+
+    Attributes:
+        knots_x: (n + 4,), mm, quadruple at both ends.
+        knots_y: (m + 4,), mm.
+        coefficients: (n, m), mm.
+    """
+
+    knots_x: np.ndarray
+    knots_y: np.ndarray
+    coefficients: np.ndarray
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Return the control points (n, m, 3), mm: over the Greville abscissae x(u) = u exactly."""
+        x, y = np.meshgrid(greville(self.knots_x), greville(self.knots_y), indexing="ij")
+        return np.stack([x, y, self.coefficients], -1)
+
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return z (mm) at points (mm) of the rectangle, (N,)."""
+        rows = ScipySpline.design_matrix(x, self.knots_x, 3) @ self.coefficients
+        return np.asarray(
+            ScipySpline.design_matrix(y, self.knots_y, 3).multiply(rows).sum(-1)
+        ).ravel()
+
+
+def tensor_spline(face: Face, reach: float, used: float, tolerance: float) -> TensorSpline:
+    """Return a surface as a tensor-product spline over the square of half width `reach`.
+
+    The spline of a `b_spline` surface is taken over as it is; past its rectangle it goes on
+    straight, as the surface does.  Any other shape is interpolated on grids that become finer until
+    it is met within a tenth of the tolerance.
+
+    Args:
+        face: of any shape.
+        reach: mm, half width of the square.
+        used: mm, radius of the disc within which the tolerance holds.
+        tolerance: mm.
+
+    Raises:
+        InputError: no spline of reasonable size comes within the tolerance.
+    """
+    if issubclass(face.shape, BSpline):
+        return _collocated(face, _own_knots(face, "x", reach), _own_knots(face, "y", reach))
+    spans = _FIRST_SPANS_ACROSS
+    while spans <= _MOST_SPANS_ACROSS:
+        inner = np.linspace(-reach, reach, spans + 1)
+        knots = np.concatenate([[-reach] * 3, inner, [reach] * 3])
+        spline = _collocated(face, knots, knots)
+        between = -reach + (np.arange(spans)[:, None] + np.array(_BETWEEN_KNOTS)).ravel() * (
+            2.0 * reach / spans
+        )
+        x, y = (grid.ravel() for grid in np.meshgrid(between, between))
+        inside = np.hypot(x, y) <= used
+        x, y = x[inside], y[inside]
+        error = np.abs(spline(x, y) - face.sag(x, y)).max()
+        if error <= _SHARE_OF_TOLERANCE * tolerance:
+            return spline
+        spans *= 2
+    raise InputError(
+        f"surface {face.number}: no spline of up to {_MOST_SPANS} × {_MOST_SPANS} spans follows "
+        f"its sag to {1e6 * tolerance:g} nm (the last one was off by {1e6 * error:.3g} nm)"
+    )
+
+
+def _collocated(face: Face, knots_x: np.ndarray, knots_y: np.ndarray) -> TensorSpline:
+    """Return the spline with these knots that meets the sag at the Greville abscissae."""
+    u, v = greville(knots_x), greville(knots_y)
+    x, y = np.meshgrid(u, v, indexing="ij")
+    # Where the branch has ended, in the corners, the numbers are finite and touch little inside.
+    values = face.sag_and_slopes(x, y)[0]
+    a = ScipySpline.design_matrix(u, knots_x, 3).toarray()
+    b = ScipySpline.design_matrix(v, knots_y, 3).toarray()
+    return TensorSpline(knots_x, knots_y, np.linalg.solve(b, np.linalg.solve(a, values).T).T)
+
+
+def _own_knots(face: Face, axis: str, reach: float) -> np.ndarray:
+    """Return a spline surface's own knots, clamped, with a straight piece where it must go on."""
+    stored = face.parameters[f"knots_{axis}"].numpy()
+    low, high = stored[3], stored[-4]
+    inner, counts = np.unique(stored[(stored > low) & (stored < high)], return_counts=True)
+    if (counts > 3).any():
+        raise InputError(f"surface {face.number}: its spline has a step, which no solid can have")
+    knots = [np.repeat(inner, counts)]
+    # Two continuous numbers, value and slope, across the end of the rectangle: a double knot.
+    knots.insert(0, np.array([-reach] * 4 + [low] * 2) if -reach < low else np.full(4, low))
+    knots.append(np.array([high] * 2 + [reach] * 4) if reach > high else np.full(4, high))
+    return np.concatenate(knots)
+
 
 # A solid, face, edge or wire of the modeller; its package has no types that could be named here.
 Shape = Any

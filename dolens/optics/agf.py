@@ -97,7 +97,7 @@ def parse_agf(text: str, where: str) -> dict[str, AgfEntry]:
     """Sort the lines of a catalogue by glass; of two glasses of one name the first is kept.
 
     Args:
-        text: the file's content, decoded (see `dolens.file_text`).
+        text: the file's content, decoded (see `dolens.files`).
         where: name of the file in messages.
 
     Returns:

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text, read_file
+from dolens.files import decode_text, read_file
 from dolens.optics.agf import AgfEntry, parse_agf, read_entry
 from dolens.optics.glass import Glass
 

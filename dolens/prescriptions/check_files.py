@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dolens.errors import InputError, one_line
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.files import SUFFIXES, read_lens_file
 

@@ -9,17 +9,15 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError, did_you_mean
-from dolens.file_text import read_file
+from dolens.files import packaged_configuration, read_file, written_whole
 from dolens.optics.glass_folders import glass_folders
 from dolens.optics.lens import Lens
-from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
 from dolens.prescriptions.published import PUBLISHED_KEY
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.yaml_text import plain_values
-from dolens.whole_files import written_whole
 
 __all__ = [
     "SUFFIXES",

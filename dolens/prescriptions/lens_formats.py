@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.file_text import decode_text, much_at_once, without_controls
+from dolens.files import decode_text, much_at_once, without_controls
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.curved_object import curved_object

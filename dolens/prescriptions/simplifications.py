@@ -6,7 +6,7 @@ from pathlib import PurePath
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.file_text import without_controls
+from dolens.files import without_controls
 from dolens.optics.materials import NO_GLASS, Medium, abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.codev.glass import glass_word

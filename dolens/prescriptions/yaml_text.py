@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from dolens.errors import InputError, one_line
-from dolens.file_text import much_at_once
+from dolens.files import much_at_once
 from dolens.prescriptions.read_file import ReadPrescription
 
 # Far more than a lens has; aliases (*name) let a short file mean billions of values.

@@ -61,7 +61,7 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     """Read a lens from the text of a `.zmx` file, and list what is passed over.
 
     Args:
-        text: the file's content, decoded (see `dolens.file_text`).
+        text: the file's content, decoded (see `dolens.files`).
         where: name in messages, usually its path.
 
     Returns:

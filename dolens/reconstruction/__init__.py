@@ -3,32 +3,34 @@ metrics.
 """
 
 from dolens.reconstruction.adversarial import (
+    GlobalDiscriminator,
+    PatchDiscriminator,
     RelativisticDiscriminators,
     relativistic_discriminator_loss,
     relativistic_generator_loss,
 )
 from dolens.reconstruction.backbones import Backbone, load_backbone
-from dolens.reconstruction.discriminators import GlobalDiscriminator, PatchDiscriminator
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
 from dolens.reconstruction.feature_wiener import FeatureWienerRestoration
-from dolens.reconstruction.field_coordinates import field_channels
 from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.losses import (
     RestorationLoss,
+    VGG16Features,
+    load_vgg16_weights,
     mean_absolute_error,
     mean_squared_error,
+    perceptual_loss,
     total_variation,
 )
-from dolens.reconstruction.nafnet import NAFNet
-from dolens.reconstruction.nafnet_restoration import NAFNetRestoration, WienerNAFNetRestoration
+from dolens.reconstruction.nafnet import NAFNet, NAFNetRestoration, WienerNAFNetRestoration
 from dolens.reconstruction.opponent_wiener import opponent_wiener_deconvolve
-from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.quality import psnr_db, structural_similarity
 from dolens.reconstruction.restoration import (
     FeaturePyramidRestoration,
     Restoration,
     UNetRestoration,
     WienerUNetRestoration,
+    field_channels,
 )
 from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 from dolens.reconstruction.unet import UNet

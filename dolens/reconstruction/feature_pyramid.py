@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from dolens.errors import InputError
 from dolens.reconstruction.backbones import Backbone
-from dolens.reconstruction.padding import pad_to_multiple
+from dolens.reconstruction.unet import pad_to_multiple
 
 _SLOPE = 0.2
 

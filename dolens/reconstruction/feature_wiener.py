@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.reconstruction.field_coordinates import (
+from dolens.reconstruction.opponent_wiener import OpponentWiener, check_functions, correlations
+from dolens.reconstruction.restoration import (
+    COLORS,
     FIELD_CHANNELS,
+    Restoration,
     required_field,
     with_field_channels,
 )
-from dolens.reconstruction.opponent_wiener import OpponentWiener, check_functions, correlations
-from dolens.reconstruction.restoration import COLORS, Restoration
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import (
     close_periodically,

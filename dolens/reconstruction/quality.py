@@ -1,5 +1,11 @@
-"""Image quality is measured by PSNR and SSIM, image by image."""
+"""Image quality is measured by PSNR and SSIM, with confidence intervals by bootstrap."""
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from scipy.special import ndtr, stdtrit
 from torch import Tensor
 from torchmetrics.functional.image import (
     peak_signal_noise_ratio,
@@ -83,3 +89,156 @@ def _check_shapes(restored: Tensor, truth: Tensor) -> None:
             f"restored {tuple(restored.shape)} and truth {tuple(truth.shape)}: "
             "expected one shape (B, C, H, W) for both"
         )
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An `Interval` holds an estimate and its confidence interval, in the units of the scores.
+
+    Attributes:
+        estimate: the mean over seeds of the statistic of means over photographs.
+        low: lower end; NaN where there is one seed and one photograph.
+        high: upper end; NaN likewise.
+        seeds: how many seeds were resampled.
+        photographs: how many photographs were resampled.
+    """
+
+    estimate: float
+    low: float
+    high: float
+    seeds: int
+    photographs: int
+
+
+def bootstrap_interval(
+    scores: Tensor,
+    statistic: Callable[[Tensor], Tensor],
+    generator: torch.Generator,
+    level: float = 0.95,
+    resamples: int = 4000,
+) -> Interval:
+    """Return the bootstrap interval of a statistic of mean scores, averaged over seeds.
+
+    Each seed's camera has a statistic of its own, as the view that is worst for it, so that an
+    estimate is the mean of what is printed for each seed, and a gain the difference of two means.
+
+    Seeds and photographs are crossed: each seed's camera is judged on each photograph.  Both are
+    resampled, independently of each other and with replacement (Owen 2007, "The pigeonhole
+    bootstrap").  From n of either, n - 1 are drawn, so that the variance of a resampled mean is the
+    unbiased s²/n (McCarthy and Snowden 1985).  What seeds and photographs do together counts up to
+    three times, which makes the interval a little too wide rather than too narrow.
+
+    Each end is the farther of two.  One is the resamples' percentile that Student's t asks for
+    (Hesterberg 2015, "expanded percentile"): Φ(-t_{α/2, ν}) in place of α/2.  It follows skewed
+    scores, but never leaves the resamples, which few seeds or photographs cannot spread far enough.
+    The other is the estimate ± t_{α/2, ν} standard deviations of the resamples.  ν is by Welch and
+    Satterthwaite from jackknife variances over seeds and over photographs.  With one seed the
+    interval says nothing about other seeds.
+
+    Paired comparisons put the scores of both cameras into the last axis of the same tensor: then
+    every resample has the same seeds and photographs for both.
+
+    Args:
+        scores: (S, P, K): seed, photograph, and whatever the statistic takes, such as views.
+        statistic: maps mean scores (R, K) to (R,), each row by itself.
+        generator: draws the resamples; on the CPU.
+
+    Rarely needed:
+        level: confidence level, between 0 and 1.
+        resamples: how many.
+
+    Raises:
+        ValueError: the shape is not (S, P, K) with at least one of each, the level is not between 0
+            and 1, or there are fewer than 2 resamples.
+    """
+    if scores.dim() != 3 or scores.numel() == 0:
+        raise ValueError(f"scores: shape {tuple(scores.shape)}; allowed: (seeds, photographs, any)")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level: {level}; allowed: between 0 and 1")
+    if resamples < 2:
+        raise ValueError(f"resamples: {resamples}; allowed: 2 or more")
+    scores = scores.detach().to("cpu", torch.float64)
+    seeds, photographs, _ = scores.shape
+    estimate = float(statistic(scores.mean(dim=1)).mean())
+    if seeds == photographs == 1 or not bool(scores.isfinite().all()):
+        return Interval(estimate, math.nan, math.nan, seeds, photographs)
+    of_seeds = _weights(seeds, resamples, generator)
+    of_photographs = _weights(photographs, resamples, generator)
+    means = torch.einsum("rp,spk->rsk", of_photographs, scores)
+    found = (of_seeds * statistic(means.flatten(0, 1)).view(resamples, seeds)).sum(dim=1)
+    degrees = _degrees_of_freedom(scores, statistic)
+    quantile = float(stdtrit(degrees, 0.5 * (1.0 + level)))
+    tails = torch.tensor([ndtr(-quantile), ndtr(quantile)], dtype=found.dtype)
+    low, high = torch.quantile(found, tails).tolist()
+    half_width = quantile * float(found.std())
+    low, high = min(low, estimate - half_width), max(high, estimate + half_width)
+    return Interval(estimate, low, high, seeds, photographs)
+
+
+def gain_interval(
+    scores: Tensor,
+    against: Tensor,
+    statistic: Callable[[Tensor], Tensor],
+    generator: torch.Generator,
+    level: float = 0.95,
+    resamples: int = 4000,
+) -> Interval:
+    """Return the paired interval of a gain, the mean over seeds of statistic(mean scores) -
+    statistic(mean against).
+
+    Args:
+        scores: (S, P, K), see `bootstrap_interval`.
+        against: those of the other camera, (S, P, K), with the same seeds and photographs in the
+            same order.
+        statistic: maps mean scores (R, K) to (R,).
+        generator: draws the resamples.
+
+    Rarely needed:
+        level: confidence level, between 0 and 1.
+        resamples: how many.
+
+    Raises:
+        ValueError: the shapes differ, or as in `bootstrap_interval`.
+    """
+    if scores.shape != against.shape:
+        raise ValueError(
+            f"scores of shape {tuple(scores.shape)} against {tuple(against.shape)}; allowed: the "
+            "same seeds, photographs and views"
+        )
+    count = scores.shape[-1]
+
+    def difference(means: Tensor) -> Tensor:
+        return statistic(means[..., :count]) - statistic(means[..., count:])
+
+    both = torch.cat((scores, against), dim=-1)
+    return bootstrap_interval(both, difference, generator, level, resamples)
+
+
+def _weights(count: int, resamples: int, generator: torch.Generator) -> Tensor:
+    """Return weights (resamples, count) of means over `count - 1` draws with replacement; 1 for
+    one.
+    """
+    if count == 1:
+        return torch.ones(resamples, 1, dtype=torch.float64)
+    drawn = torch.randint(count, (resamples, count - 1), generator=generator)
+    weights = torch.zeros(resamples, count, dtype=torch.float64)
+    return weights.scatter_add_(1, drawn, torch.full(drawn.shape, 1.0 / (count - 1)).double())
+
+
+def _degrees_of_freedom(scores: Tensor, statistic: Callable[[Tensor], Tensor]) -> float:
+    """Return Welch and Satterthwaite's ν = (Σ V)² / Σ (V² / (n - 1)), V by jackknife over each
+    axis.
+    """
+    seeds, photographs, _ = scores.shape
+    of_seeds = statistic(scores.mean(dim=1))
+    without = (scores.sum(dim=1, keepdim=True) - scores) / max(photographs - 1, 1)
+    of_photographs = statistic(without.flatten(0, 1)).view(seeds, photographs).mean(dim=0)
+    variances, weighted = 0.0, 0.0
+    for values, factor in ((of_seeds, 1 / max(seeds - 1, 1)), (of_photographs, photographs - 1)):
+        count = len(values)
+        if count == 1:
+            continue
+        variance = float(values.var(correction=0)) * factor
+        variances += variance
+        weighted += variance**2 / (count - 1)
+    return variances**2 / weighted if weighted > 0.0 else math.inf

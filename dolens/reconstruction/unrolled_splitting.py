@@ -8,18 +8,19 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.reconstruction.feature_wiener import NOISE_TO_SIGNAL
-from dolens.reconstruction.field_coordinates import (
-    FIELD_CHANNELS,
-    required_field,
-    with_field_channels,
-)
 from dolens.reconstruction.opponent_wiener import (
     OpponentWiener,
     check_functions,
     correlations,
     solve_in_opponent_colours,
 )
-from dolens.reconstruction.restoration import COLORS, Restoration
+from dolens.reconstruction.restoration import (
+    COLORS,
+    FIELD_CHANNELS,
+    Restoration,
+    required_field,
+    with_field_channels,
+)
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import close_periodically, padded_lengths, squared_frequency
 from dolens.sensor.colour import linear_to_srgb, srgb_to_linear

@@ -23,8 +23,7 @@ from dolens.rendering.pupil.pupil_boundary import PupilBoundaryMap
 from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 from dolens.rendering.random_numbers import random_words, uniform
 from dolens.rendering.sampling import square_to_disc, stratified_square
-from dolens.scene.scene import Scene
-from dolens.scene.texture import texture_coordinates
+from dolens.scene.scene import Scene, texture_coordinates
 from dolens.sensor.pixels import Sensor
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patch_convolution import convolve_patches
 from dolens.rendering.patches import Coordinates, PatchLayout
-from dolens.scene.texture import texture_origin
+from dolens.scene.scene import texture_origin
 
 
 @dataclass(frozen=True)

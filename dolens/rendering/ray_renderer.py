@@ -27,9 +27,8 @@ from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
 from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
 from dolens.rendering.pupil.pixel_edges import edge_samples
 from dolens.rendering.pupil.pupil_boundary import pupil_boundary_map
-from dolens.scene.scene import Scene
-from dolens.scene.texture import texture_origin
-from dolens.seeded_generators import generator_of
+from dolens.scene.scene import Scene, texture_origin
+from dolens.sensor.noise import generator_of
 from dolens.sensor.pixels import Sensor
 
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 from dolens.analysis.ray_intercepts import uniform_pupil_points
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import pupil_rays, rim_rays
-from dolens.scene.texture import bilinear
+from dolens.scene.scene import bilinear
 from dolens.sensor.pixels import Sensor
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.

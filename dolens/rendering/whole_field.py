@@ -37,7 +37,7 @@ from dolens.rendering.psf_grid import FieldPointSpreadFunctions, PointShare
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.relative_illumination import IlluminationMap
 from dolens.scene.planar import PlanarScene, as_planes
-from dolens.scene.texture import resized, texture_origin
+from dolens.scene.scene import resized, texture_origin
 from dolens.sensor.pixels import Sensor
 
 # RMS grey levels, of 255 in linear light, that images may be off.

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.scene.scene import Blur, Scene
-from dolens.scene.texture import bilinear
+from dolens.scene.scene import Blur, Scene, bilinear
 from dolens.sensor.pixels import Sensor
 
 

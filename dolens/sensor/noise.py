@@ -1,9 +1,65 @@
-"""A pixel has shot noise, from the light, and read noise, from the electronics."""
+"""Random noise: shot noise and read noise of pixels, from seeds, in any share of a batch."""
+
+import hashlib
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dolens.sensor.batch_share import BatchShare
+
+def noisy_point_spread_functions(
+    functions: Tensor, electrons: float, read_noise: float, generator: torch.Generator
+) -> Tensor:
+    """Return point spread functions with simulated photon noise and read noise.
+
+    A function h of sum Σh is measured with N electrons in the whole of it: pixel i counts a Poisson
+    number n_i of mean N·h_i/Σh, and a normal number of the read noise is added.  The result
+    is Σh·n_i/Σn, so that the measured function has the same sum.  Nothing is cut at zero.
+
+    Args:
+        functions: (..., K, K), not negative.
+        electrons: N.
+        read_noise: standard deviation, electrons a pixel.
+        generator: on the CPU.
+
+    Returns:
+        (..., K, K), in the functions' dtype, without gradient.
+    """
+    exact = functions.detach().cpu().double().clamp(min=0.0)
+    total = exact.sum((-2, -1), keepdim=True)
+    counts = torch.poisson(electrons * exact / total, generator=generator)
+    noise = torch.randn(counts.shape, dtype=counts.dtype, generator=generator)
+    counts = counts + read_noise * noise
+    return (total * counts / counts.sum((-2, -1), keepdim=True)).to(functions)
+
+
+class BatchShare(NamedTuple):
+    """A `BatchShare` says which images of a larger batch a process has.
+
+    Random numbers are drawn for the whole batch, and each process keeps its own part of them, so
+    that all processes together see what one process would see.
+
+    Attributes:
+        first: number in the batch of the first image here.
+        total: images of the whole batch.
+    """
+
+    first: int
+    total: int
+
+    def normal(self, like: Tensor, generator: torch.Generator) -> Tensor:
+        """Draw standard normal numbers for the whole batch, and return those of this share.
+
+        Args:
+            like: (B, ...), the images here.
+            generator: on their device.
+
+        Returns:
+            (B, ...), of the images' precision.
+        """
+        shape = (self.total, *like.shape[1:])
+        drawn = torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
+        return drawn[self.first : self.first + len(like)]
 
 
 def add_read_noise(
@@ -71,3 +127,19 @@ def _normal(image: Tensor, generator: torch.Generator, share: BatchShare | None)
     if share is not None:
         return share.normal(image, generator)
     return torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)
+
+
+def generator_of(seed: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """Return a generator for a seed of any size.
+
+    PyTorch's generator of the CPU (a Mersenne twister) takes the 32 lowest bits of a seed alone:
+    seeds that differ by a multiple of 2³² would draw the same numbers.  Here the seed's BLAKE2b
+    hash is the generator's seed.
+
+    Args:
+        seed: any integer.
+        device: of the generator.
+    """
+    digest = hashlib.blake2b(str(seed).encode(), digest_size=8).digest()
+    # The largest seed of a generator is 2⁶³ - 1.
+    return torch.Generator(device).manual_seed(int.from_bytes(digest, "big") >> 1)

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.sensor.batch_share import BatchShare
-from dolens.sensor.bayer import check_pattern, demosaic, mosaic
-from dolens.sensor.noise import add_read_noise, add_shot_noise
+from dolens.sensor.colour import check_pattern, demosaic, mosaic
+from dolens.sensor.noise import BatchShare, add_read_noise, add_shot_noise
 
 _MOST_BITS = 16
 

@@ -13,7 +13,7 @@ from dolens.experiments.experiment import Experiment, Figures
 from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.plotting import figure_to_image, save_figures
 from dolens.plotting.export import FORMATS, laid_out
-from dolens.stages import stage
+from dolens.tasks import stage
 
 logger = logging.getLogger(__name__)
 

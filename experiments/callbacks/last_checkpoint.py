@@ -8,7 +8,7 @@ from typing import Any
 import lightning
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from dolens.whole_files import written_whole
+from dolens.files import written_whole
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Any
 import lightning
 import torch
 
-from dolens.processors import ThreadClock, ThreadTimes, allowed_processors
+from dolens.threads import ThreadClock, ThreadTimes, allowed_processors
 
 logger = logging.getLogger(__name__)
 

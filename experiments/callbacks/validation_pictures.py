@@ -16,7 +16,7 @@ from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import gathered
 from dolens.sensor.colour import linear_to_srgb
-from dolens.stages import stage
+from dolens.tasks import stage
 
 _GAP, _TEXT = 4, 15  # pixels between pictures, and of the line of text above them
 # Wider pictures are cut to their middle: a log is no archive.

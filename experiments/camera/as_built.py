@@ -12,8 +12,7 @@ from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.views.base import Imaging, seed_of
 from dolens.experiments.checks import check_count, check_positive
 from dolens.optics.lens import Lens
-from dolens.seeded_generators import generator_of
-from dolens.sensor.psf_noise import noisy_point_spread_functions
+from dolens.sensor.noise import generator_of, noisy_point_spread_functions
 from dolens.tolerancing import (
     FocusTarget,
     Tolerances,

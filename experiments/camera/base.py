@@ -20,7 +20,7 @@ from dolens.experiments.experiment import Experiment
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction.processes import processes
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare
 
 
 class Camera(Experiment):

@@ -15,7 +15,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
-from dolens.sensor.psf_noise import noisy_point_spread_functions
+from dolens.sensor.noise import noisy_point_spread_functions
 from dolens.tolerancing import assembled, tolerances_from
 
 

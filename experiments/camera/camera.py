@@ -47,7 +47,7 @@ from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import UntrainedRestoration, psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

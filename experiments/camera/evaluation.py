@@ -18,9 +18,9 @@ from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.reconstruction.processes import gathered
 from dolens.reconstruction.quality import SIMILARITY_WINDOW
-from dolens.seeded_generators import generator_of
 from dolens.sensor.colour import linear_to_srgb
-from dolens.stages import stage as named_stage
+from dolens.sensor.noise import generator_of
+from dolens.tasks import stage as named_stage
 
 # Stage → metric → number of a batch → scores (B, V).
 Rows = dict[str, dict[str, dict[int, Tensor]]]

@@ -19,7 +19,7 @@ from dolens.plotting import comparison_figure, layout_figure, psf_figure
 from dolens.plotting.layout import layout_title, lens_title, optics_text, shown_name
 from dolens.plotting.number_text import number_text
 from dolens.reconstruction import psnr_db
-from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities
+from dolens.reconstruction.likelihood import depth_picture, depth_probabilities
 from dolens.reconstruction.opponent_wiener import functions_of_each
 from dolens.sensor.colour import linear_to_srgb
 

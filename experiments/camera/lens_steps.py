@@ -17,7 +17,7 @@ from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 
 
 class LensSteps:

@@ -10,7 +10,7 @@ from dolens.errors import InputError
 from dolens.experiments.camera.as_built import MadeLens, Manufacture
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.views.base import Views
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare
 
 
 def training_images(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from dolens.experiments.camera.photograph_scores import PhotographScores, statistics_of
-from dolens.reconstruction.intervals import Interval, gain_interval
+from dolens.reconstruction.quality import Interval, gain_interval
 
 
 def paired_gain(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.tables import Row
-from dolens.reconstruction.intervals import Interval, bootstrap_interval
+from dolens.reconstruction.quality import Interval, bootstrap_interval
 
 
 def table_name(stage: str = "test") -> str:

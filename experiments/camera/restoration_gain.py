@@ -11,7 +11,7 @@ from dolens.experiments.camera.photograph_scores import (
     statistics_of,
 )
 from dolens.experiments.camera.untrained_rivals import RIVALS
-from dolens.reconstruction.intervals import Interval, gain_interval
+from dolens.reconstruction.quality import Interval, gain_interval
 
 # Gains by their names: over which scores of the same test they are, and what those are of.
 OVER = {

@@ -27,8 +27,8 @@ from dolens.lens_search.search import SearchPlan
 from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
-from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

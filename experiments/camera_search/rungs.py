@@ -8,7 +8,7 @@ from dolens.experiments.camera.photograph_gain import paired_gain
 from dolens.experiments.camera.photograph_scores import PhotographScores, read_scores
 from dolens.experiments.camera_search.rung_callbacks import stage_of
 from dolens.experiments.camera_search.trained_camera import TrainedCamera
-from dolens.reconstruction.intervals import Interval
+from dolens.reconstruction.quality import Interval
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dolens.experiments.commands.apply_options import LensOptions
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
 from dolens.reconstruction import GeneralRestoration
-from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities
+from dolens.reconstruction.likelihood import depth_picture, depth_probabilities
 from dolens.reconstruction.whole_pictures import restore_whole_picture
 from dolens.rendering.lens_camera import (
     colours_of,

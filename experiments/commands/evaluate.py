@@ -42,7 +42,7 @@ from dolens.experiments.running.run_folder import (
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import summary_of
 from dolens.experiments.running.trust import own_folder
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)

@@ -15,10 +15,14 @@ from dolens.experiments.camera.network_export import FORMATS as NETWORK_FORMATS
 from dolens.experiments.camera.network_export import export_onnx, export_torch
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
-from dolens.manufacturing.design_files import design_hash
-from dolens.manufacturing.export_record import program_name, write_record
 from dolens.manufacturing.lens_export import FORMATS as LENS_FORMATS
-from dolens.manufacturing.lens_export import Exported, export_lens
+from dolens.manufacturing.lens_export import (
+    Exported,
+    design_hash,
+    export_lens,
+    program_name,
+    write_record,
+)
 from dolens.manufacturing.shop_tolerances import ShopTolerances, drawn_labels, read_tolerances
 from dolens.manufacturing.step import TOLERANCE_NM
 from dolens.optics.lens import Lens

@@ -26,7 +26,7 @@ from dolens.experiments.comparison.metrics import (
 from dolens.experiments.comparison.rows import Row, Rows, chosen_row, rows_of, text_of
 from dolens.plotting.number_text import with_minus
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
-from dolens.reconstruction.intervals import Interval
+from dolens.reconstruction.quality import Interval
 
 NONE = "–"
 # So many experiments are named in a title.

@@ -7,7 +7,7 @@ from pathlib import Path
 from dolens.errors import InputError
 from dolens.experiments.comparison.run import Run, UnfinishedRun, read_run, read_unfinished
 from dolens.experiments.running.run_files import CONFIG, HYDRA, has_metrics
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dolens.experiments.camera.photograph_gain import paired_gain
 from dolens.experiments.comparison.rows import Row
 from dolens.experiments.comparison.run import Run
-from dolens.reconstruction.intervals import Interval
+from dolens.reconstruction.quality import Interval
 
 
 def gain_of(row: Row, against: Row, metric: str) -> Interval | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dolens.experiments.data.folder_index import REFUSED, SOUND, FolderIndex
 from dolens.sensor.pictures import probe_picture
-from dolens.stages import stage
+from dolens.tasks import stage
 
 _log = logging.getLogger(__name__)
 

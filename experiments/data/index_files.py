@@ -19,8 +19,8 @@ from dolens.errors import InputError
 from dolens.experiments.data.folder_index import REFUSED, FolderIndex, check_folder, index_of
 from dolens.experiments.data.folder_listing import Listing, walked
 from dolens.experiments.data.packed_names import PackedNames
-from dolens.stages import stage
-from dolens.user_cache import delete_old, user_cache_folder, write_whole
+from dolens.files import delete_old, user_cache_folder, write_whole
+from dolens.tasks import stage
 
 _log = logging.getLogger(__name__)
 

@@ -37,7 +37,7 @@ from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
 from dolens.optimize.states import StatesMerit, StatesValue
 from dolens.prescriptions import lens_from_prescription
-from dolens.stages import stage
+from dolens.tasks import stage
 
 logger = logging.getLogger(__name__)
 

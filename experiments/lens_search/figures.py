@@ -8,10 +8,8 @@ from matplotlib.figure import Figure
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.lens_search.finds import Finds
-from dolens.lens_search.course import search_course
 from dolens.lens_search.form_report import FormReport
-from dolens.lens_search.results import sections_figure
-from dolens.lens_search.start_map import start_map
+from dolens.lens_search.search_report import search_course, sections_figure, start_map
 from dolens.plotting.search_course import search_course_figure
 from dolens.plotting.starts import starts_figure
 

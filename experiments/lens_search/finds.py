@@ -6,12 +6,10 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.designed_lens import designed_lens
-from dolens.lens_search.designs import Designs
-from dolens.lens_search.form_words import glasses_text
-from dolens.lens_search.forms import distinct
-from dolens.lens_search.found import FoundLens
-from dolens.lens_search.lens_merit import merit_of
+from dolens.lens_search.designs import Designs, designed_lens
+from dolens.lens_search.form_report import glasses_text
+from dolens.lens_search.forms import FoundLens, distinct
+from dolens.lens_search.glass.glass_merit import merit_of
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.search import SearchPlan, Step, with_step
 from dolens.lens_search.specification import Specification

@@ -11,13 +11,13 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.files import written_whole
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs
-from dolens.lens_search.glass.glass_set import chosen_glasses
+from dolens.lens_search.glass.choice import chosen_glasses
 from dolens.lens_search.search import SearchPlan, Step
 from dolens.lens_search.specification import Specification
 from dolens.tasks import TaskMap
-from dolens.whole_files import written_whole
 
 
 class KeptSteps:

@@ -8,11 +8,11 @@ import torch
 from dolens.experiments.lens_search.figures import course_picture, starts_picture
 from dolens.experiments.lens_search.finds import Course, Finds
 from dolens.lens_search.form_report import FormReport, report_form
-from dolens.lens_search.found import FoundLens
+from dolens.lens_search.forms import FoundLens
 from dolens.lens_search.page import Pictures
-from dolens.lens_search.requirements import Requirements
-from dolens.lens_search.results import write_page
+from dolens.lens_search.search_report import write_page
 from dolens.lens_search.specification import Specification
+from dolens.lens_search.verification import Requirements
 
 
 def form_reports(finds: Finds, folder: Path) -> list[FormReport]:

@@ -21,16 +21,16 @@ from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.course import WITHIN
-from dolens.lens_search.designed_lens import designed_lens
+from dolens.lens_search.designs import designed_lens
 from dolens.lens_search.form_report import FormReport
+from dolens.lens_search.glass.glass_merit import merit_of
 from dolens.lens_search.growth import STAGES
-from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.search import SearchPlan, search
+from dolens.lens_search.search_report import WITHIN
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import random_starts
 from dolens.optics.lens import Lens
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

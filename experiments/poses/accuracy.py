@@ -39,8 +39,8 @@ from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
-from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.tasks import stage as named_stage
 from dolens.typed_values import call_with_settings, check_types
 
 logger = logging.getLogger(__name__)

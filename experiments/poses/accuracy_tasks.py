@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.alignment.image_losses import SpotLoss
 from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss
 from dolens.experiments.poses.bench import Bench, Light, draw, simulate
 from dolens.rendering.spot_image import SpotImager
 

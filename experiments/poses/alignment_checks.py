@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from dolens.alignment.moment_noise import MeasuredMoments
-from dolens.alignment.pixel_moments import Pixels, grid_error
+from dolens.alignment.element_fit import MeasuredMoments
+from dolens.alignment.moments import Pixels, grid_error
 from dolens.alignment.spot_moments import MomentModel
 
 # Places of the pixels' grid that are tried.

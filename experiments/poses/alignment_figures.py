@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.alignment.pixel_moments import Pixels
+from dolens.alignment.moments import Pixels
 from dolens.experiments.poses.alignment_result import COLUMNS, Alignment
 from dolens.plotting.style import DASHES, PAGE, SMALL, TITLE, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks

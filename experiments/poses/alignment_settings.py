@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.element_fit import POSE
-from dolens.alignment.pixel_moments import Pixels
+from dolens.alignment.moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.checks import check_count, check_finite, check_positive

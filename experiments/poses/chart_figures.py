@@ -6,9 +6,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.alignment.chart import MarkWindows
 from dolens.alignment.chart_fit import ChartFit
 from dolens.alignment.chart_model import ChartModel
-from dolens.alignment.mark_windows import MarkWindows
 from dolens.experiments.poses.chart_restoration import ARMS
 from dolens.experiments.poses.chart_result import FittedSpecimen, restored
 from dolens.plotting.captions import plain_text

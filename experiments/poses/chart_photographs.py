@@ -8,13 +8,11 @@ from typing import Any, ClassVar
 
 import torch
 
-from dolens.alignment.chart import Chart
+from dolens.alignment.chart import Chart, MarkWindows
 from dolens.alignment.chart_fit import ChartFit, Prior, fit_chart
-from dolens.alignment.chart_model import ChartModel
+from dolens.alignment.chart_model import ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight
-from dolens.alignment.chart_rays import ChartRays
-from dolens.alignment.mark_windows import MarkWindows
-from dolens.alignment.spot_intercepts import one_thread
+from dolens.alignment.spot_moments import one_thread
 from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
@@ -58,7 +56,7 @@ from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.straight import require_plane_sensor
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 from dolens.tolerancing import tolerances_from
 
 logger = logging.getLogger(__name__)

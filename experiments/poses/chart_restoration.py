@@ -8,17 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.alignment.chart import CHART_POSE, Chart
-from dolens.alignment.chart_model import BLUR, ChartModel
+from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, Chart
+from dolens.alignment.chart_model import BLUR, ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
-from dolens.alignment.chart_rays import ChartRays
-from dolens.alignment.sensor_pose import SENSOR_POSE
 from dolens.experiments.data.photos import TEST, VALIDATION, read_installed
 from dolens.experiments.poses.chart_settings import Restoration
 from dolens.reconstruction.wiener import transfer_function, wiener_deconvolve
 from dolens.rendering.binning import bin_rays
-from dolens.seeded_generators import generator_of
 from dolens.sensor.colour import srgb_to_linear
+from dolens.sensor.noise import generator_of
 
 # A scene that is far away, mm; its points are so small that their images are a tenth of a pixel.
 _FAR, _POINT = 1e6, 0.1

@@ -7,18 +7,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.alignment.chart import CHART_POSE
+from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, MarkWindows
 from dolens.alignment.chart_fit import Prior
 from dolens.alignment.chart_model import BLUR, LARGER, ChartModel, plane_error
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
-from dolens.alignment.mark_windows import MarkWindows
-from dolens.alignment.photograph import read_measurement
-from dolens.alignment.sensor_pose import SENSOR_POSE
+from dolens.alignment.measurement import read_measurement
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
 from dolens.experiments.poses.chart_settings import ChartEffects
 from dolens.optics.lens import Lens
-from dolens.seeded_generators import generator_of
+from dolens.sensor.noise import generator_of
 from dolens.tolerancing import Tolerances
 from dolens.typed_values import call_with_settings
 

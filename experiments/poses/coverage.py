@@ -19,8 +19,8 @@ from dolens.experiments.poses.misalignment import MisalignmentModule
 from dolens.experiments.poses.results import error_statistics
 from dolens.experiments.tables import Row
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

@@ -8,11 +8,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from dolens.alignment.image_losses import ImageMerit, NoiseWeightedLoss
 from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageMerit
 from dolens.errors import InputError
 from dolens.experiments.poses.settings import Fit
 from dolens.optimize.damped_least_squares import DampedLeastSquares

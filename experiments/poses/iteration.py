@@ -7,10 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.alignment.image_losses import ImageLoss, ImageMerit, NoiseWeightedLoss, SpotLoss
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageLoss, ImageMerit, SpotLoss
 from dolens.experiments.poses.settings import (
     Stage,
     blur_for,

@@ -32,8 +32,8 @@ from dolens.experiments.tables import Row, write_table
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
-from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from dolens.alignment.measurement import Measurement
-from dolens.alignment.photograph import read_measurements
+from dolens.alignment.measurement import Measurement, read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError

@@ -11,15 +11,15 @@ from torch import Tensor
 
 from dolens.alignment.element_fit import (
     POSE,
+    MeasuredMoments,
     element_names,
     fit_element,
     information_root,
     least_covariance,
     most_likely_element,
+    simulated_moments,
 )
-from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
-from dolens.alignment.spot_intercepts import one_thread
-from dolens.alignment.spot_moments import MomentModel, moment_model
+from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count, check_positive
@@ -33,7 +33,7 @@ from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import DEGREE, unit_of
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,7 @@ from torch.utils.data import Dataset
 from dolens.experiments.pretraining.random_pupils import Draw
 from dolens.reconstruction.general import Prepared, prepared
 from dolens.reconstruction.wiener import transfer_function
-from dolens.sensor.bayer import PATTERNS
-from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
+from dolens.sensor.colour import PATTERNS, linear_to_srgb, srgb_to_linear
 from dolens.sensor.readout import Readout
 
 

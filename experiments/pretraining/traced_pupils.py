@@ -13,8 +13,8 @@ from dolens.diffraction.reference_sphere import chief_ray_intercepts
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
 from dolens.experiments.pretraining.random_pupils import COARSE, GREEN, Draw
+from dolens.files import packaged_configuration
 from dolens.optics.lens import Lens
-from dolens.packaged import packaged_configuration
 from dolens.prescriptions.files import load_lens
 from dolens.tolerancing.perturbations import tolerances_from
 from dolens.tolerancing.usual import usual_tolerances, with_glass_elements

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import dolens
 import dolens.experiments
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 # What only shows results changes none.
 _SHOWN_ONLY = ("cli", "commands", "lens_page", "report")

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from dolens.experiments.report.plan import FOLDER
+from dolens.files import packaged_configuration
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.packaged import packaged_configuration
 from dolens.prescriptions import lens_from_prescription, load_prescription
 
 _NM_PER_MM = 1e6

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from dolens.experiments.report.golden_rays import load_golden_rays, trace_errors
 from dolens.experiments.running.run_files import INFO, METRICS, write_json
 from dolens.experiments.running.run_folder import describe_run, peak_memory_mb
+from dolens.files import packaged_configuration
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.packaged import packaged_configuration
 from dolens.plotting import layout_figure, save_figure
 from dolens.prescriptions import lens_from_prescription, load_lens, prescription_of
 

@@ -15,7 +15,7 @@ from dolens.experiments.running.run_files import (
     read_json,
     read_yaml,
 )
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 
 RECORD = "report_run.json"
 # Settings that change nothing in what a run finds.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dolens.errors import InputError, did_you_mean
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 USER_FOLDER = "conf"
 # A line of a defaults list that says what the group is for: `  - lens: cooke_triplet # the lens`.

@@ -11,7 +11,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
 from dolens.errors import InputError, one_line
-from dolens.whole_files import written_whole
+from dolens.files import written_whole
 
 # So much of a foreign program's reason is repeated.
 _REASON = 200

@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.recorded_run import RecordedRun
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 
 CHECKPOINTS = ("last", "best")
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 
 def no_choice(overrides: Sequence[str]) -> str | None:

@@ -8,7 +8,7 @@ from hydra.plugins.completion_plugin import CompletionPlugin
 
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.user_configuration import use_working_folder
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 
 class _Completion(CompletionPlugin):

@@ -20,7 +20,7 @@ from dolens.experiments.running.recorded_run import RecordedRun
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 # The keys that lead to a value; keys may contain dots, so that a text would not do.
 Place = tuple[Any, ...]

@@ -16,7 +16,7 @@ from dolens.experiments.running.catalogue import configuration_folders, meanings
 from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.user_configuration import use_working_folder
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from dolens.experiments.running.thread_faults import thread_faults_in_one_line
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
 from dolens.experiments.search.pruned import TrialPruned
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 logger = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from dolens.experiments.running.run_files import (
 )
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
-from dolens.file_text import resolved_path
+from dolens.files import resolved_path
 
 _RECORDS = (RESOLVED, HYDRA, OVERRIDES, INFO)
 

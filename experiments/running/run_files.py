@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dolens.errors import InputError, one_line
+from dolens.files import written_whole
 from dolens.prescriptions.yaml_text import plain_values
-from dolens.whole_files import written_whole
 
 INFO, METRICS = "run.json", "metrics.json"
 CONFIG, RESOLVED = ".hydra/config.yaml", ".hydra/resolved.yaml"

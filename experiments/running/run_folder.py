@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from dolens.packaged import installed_version
+from dolens.files import installed_version
 
 _PACKAGES = (
     "dolens",

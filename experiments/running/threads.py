@@ -6,7 +6,7 @@ import os
 import torch
 
 from dolens.errors import InputError
-from dolens.processors import allowed_processors
+from dolens.threads import allowed_processors
 
 logger = logging.getLogger(__name__)
 

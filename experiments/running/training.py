@@ -51,9 +51,9 @@ from dolens.experiments.running.target_keys import names_of_targets
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.search.pruned import TrialPruned
 from dolens.experiments.search.pruning import trial_callbacks
+from dolens.files import written_whole
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
-from dolens.whole_files import written_whole
 
 logger = logging.getLogger(__name__)
 

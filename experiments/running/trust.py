@@ -17,8 +17,7 @@ import dolens.optimize
 import dolens.reconstruction
 from dolens.errors import InputError
 from dolens.experiments.running.plain_values import walk
-from dolens.file_text import resolved_path
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration, resolved_path
 
 _TARGET = re.compile(r"_target_: *(?:([\w.]+))")
 # Of which packages every class of a kind is allowed, by the name that the package gives it.

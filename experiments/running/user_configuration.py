@@ -9,7 +9,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 from dolens.experiments.running.catalogue import user_configuration
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 
 
 class UserConfiguration(SearchPathPlugin):

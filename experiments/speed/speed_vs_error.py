@@ -21,7 +21,7 @@ from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.plotting import Point, pareto_front
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from dolens.experiments.sweeps.job_folder import (
     log_in,
     recorded_objective,
 )
-from dolens.spinning import follow_other_work
+from dolens.threads import follow_other_work
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.environment_variables import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.sweeps.shares import share_of
-from dolens.processors import allowed_processors
+from dolens.threads import allowed_processors
 
 logger = logging.getLogger(__name__)
 

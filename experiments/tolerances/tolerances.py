@@ -29,7 +29,7 @@ from dolens.experiments.workers import workers_of
 from dolens.optics.departures import names_departures
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
+from dolens.tasks import stage as named_stage
 from dolens.tolerancing import (
     Outcome,
     ToleranceAnalysis,

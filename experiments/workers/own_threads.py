@@ -9,8 +9,7 @@ from typing import Any
 
 import torch
 
-from dolens.stages import stage
-from dolens.tasks import TaskMap, error_of_task, task_label
+from dolens.tasks import TaskMap, error_of_task, stage, task_label
 
 
 @dataclass(frozen=True)

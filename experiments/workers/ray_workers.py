@@ -10,8 +10,7 @@ import torch
 
 from dolens.experiments.ray_cluster import joined_cluster, local_cluster
 from dolens.experiments.running.matmul_precision import set_matmul_precision
-from dolens.stages import stage
-from dolens.tasks import TaskError, TaskMap, error_of_task, task_label
+from dolens.tasks import TaskError, TaskMap, error_of_task, stage, task_label
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -16,7 +16,7 @@ from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.experiments.camera.views.whole import axial_function
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
-from dolens.reconstruction.linear_bound import linear_error_of_readouts, natural_spectrum
+from dolens.reconstruction.wiener import linear_error_of_readouts, natural_spectrum
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import PlanarScene

@@ -13,9 +13,9 @@ from dolens.experiments.pretraining.examples import blurred
 from dolens.plotting.style import PAGE, SMALL
 from dolens.plotting.titles import draw_title
 from dolens.reconstruction import GeneralRestoration, Restoration, WienerTVRestoration, psnr_db
-from dolens.reconstruction.intervals import Interval, gain_interval
-from dolens.reconstruction.motion import estimated_motion
-from dolens.reconstruction.readouts import shifted
+from dolens.reconstruction.likelihood import estimated_motion
+from dolens.reconstruction.quality import Interval, gain_interval
+from dolens.reconstruction.wiener import shifted
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 from scripts.coding.cameras import DepthCamera, Range, noise_of, wave_functions

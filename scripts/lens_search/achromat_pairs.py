@@ -179,8 +179,7 @@ def main() -> None:
 
 def _glasses() -> tuple[list[str], Array]:
     """Return the names (K) of the experiment's glasses and their indices at C, d and F, (K, 3)."""
-    from dolens.lens_search.glass.choice import GlassChoice
-    from dolens.lens_search.glass.glass_set import chosen_glasses
+    from dolens.lens_search.glass.choice import GlassChoice, chosen_glasses
 
     choice = GlassChoice(("SCHOTT",), tuple(NAMES.split(",")), tuple(WITHOUT))
     found = chosen_glasses(choice, (656.2725, 587.5618, 486.1327))

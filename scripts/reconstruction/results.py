@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.experiments.camera.photograph_scores import format_interval
 from dolens.plotting.quality_over_time import Curve
-from dolens.reconstruction.intervals import Interval, bootstrap_interval, gain_interval
+from dolens.reconstruction.quality import Interval, bootstrap_interval, gain_interval
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dolens.whole_files import UNFINISHED
+from dolens.files import UNFINISHED
 from scripts.tortures.processes import PATIENCE_S, Process, start, trust, write_slowly
 from scripts.tortures.run_folders import differences, faults_of, lost_rows
 

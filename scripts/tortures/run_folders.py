@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dolens import load_lens
 from dolens.experiments.running.checkpoint_files import read_checkpoint
-from dolens.whole_files import UNFINISHED
+from dolens.files import UNFINISHED
 
 # Times differ from run to run, and so does what one process of several has done.
 _OF_TIME = ("cost/", "seconds", "_s", "lens_s", "wall", "_ms", "rays_per", "memory", "auto/plans")

@@ -9,13 +9,11 @@ import torch
 from torch.func import jacfwd
 
 import dolens
-from dolens.alignment.chart import Chart
+from dolens.alignment.chart import Chart, on_sensor
 from dolens.alignment.chart_fit import Prior, fit_chart
-from dolens.alignment.chart_model import ChartModel
+from dolens.alignment.chart_model import ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, _on_tilted_plane, photographed
-from dolens.alignment.chart_rays import ChartRays
-from dolens.alignment.gaussian_derivatives import orders, smoothed_weights, weights_on_grid
-from dolens.alignment.sensor_pose import on_sensor
+from dolens.alignment.gaussian_filters import orders, smoothed_weights, weights_on_grid
 from dolens.errors import InputError
 from dolens.optics.elements import Element
 from dolens.optics.lens import Lens

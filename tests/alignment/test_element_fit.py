@@ -13,11 +13,11 @@ from dolens.alignment.element_fit import (
     fit_element,
     information_root,
     least_covariance,
+    moment_covariance,
     most_likely_element,
+    simulated_moments,
 )
-from dolens.alignment.moment_noise import moment_covariance, simulated_moments
-from dolens.alignment.moments import POWERS
-from dolens.alignment.pixel_moments import Pixels
+from dolens.alignment.moments import POWERS, Pixels
 from dolens.alignment.spot_moments import SENSOR, moment_model
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.prescriptions import lens_from_prescription

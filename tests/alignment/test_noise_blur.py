@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dolens.alignment.information import fisher_information
-from dolens.alignment.measurement import Measurement, simulated
-from dolens.alignment.noise_weighted import (
+from dolens.alignment.image_losses import (
     NoiseWeightedLoss,
     blurred_deviation,
     deviation,
     spill_left,
 )
+from dolens.alignment.information import fisher_information
+from dolens.alignment.measurement import Measurement, simulated
 from dolens.alignment.pose import Pose
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor

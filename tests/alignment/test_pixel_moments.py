@@ -6,15 +6,17 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.alignment.moment_noise import moment_covariance
-from dolens.alignment.moments import POWERS, shift_derivatives, weighted_sums
-from dolens.alignment.pixel_moments import (
+from dolens.alignment.element_fit import moment_covariance
+from dolens.alignment.moments import (
+    POWERS,
     Pixels,
     check_window,
     convolved,
     grid_error,
     observed_radius,
     read_covariance,
+    shift_derivatives,
+    weighted_sums,
 )
 
 # A spot like a comet: light from two round clouds (mm), share, centre and deviation of each.

@@ -10,12 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from dolens.alignment.image_losses import ImageMerit, ImageResiduals, NoiseWeightedLoss, SpotLoss
 from dolens.alignment.information import FisherInformation, fisher_information
-from dolens.alignment.measurement import Measurement, simulated
-from dolens.alignment.noise_weighted import NoiseWeightedLoss
-from dolens.alignment.photograph import read_measurement, read_measurements
+from dolens.alignment.measurement import Measurement, read_measurement, read_measurements, simulated
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageMerit, ImageResiduals, SpotLoss
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager

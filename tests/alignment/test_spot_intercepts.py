@@ -10,10 +10,14 @@ import yaml
 from torch.func import jacfwd, vmap
 
 from dolens import InputError, Rays
-from dolens.alignment import spot_intercepts as module
+from dolens.alignment import spot_moments as module
 from dolens.alignment.moments import POWERS, sums_and_derivatives, weighted_sums
-from dolens.alignment.spot_intercepts import KernelIntercepts, ReferenceIntercepts
-from dolens.alignment.spot_moments import SENSOR, moment_model
+from dolens.alignment.spot_moments import (
+    SENSOR,
+    KernelIntercepts,
+    ReferenceIntercepts,
+    moment_model,
+)
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.optics import backend
 from dolens.prescriptions import lens_from_prescription

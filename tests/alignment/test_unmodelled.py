@@ -7,13 +7,11 @@ import pytest
 import torch
 import yaml
 
-from dolens.alignment.diffracted_light import diffracted_light
+from dolens.alignment.image_losses import ImageMerit, NoiseWeightedLoss
 from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import simulated
-from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageMerit
-from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
+from dolens.alignment.unmodelled import Unmodelled, diffracted_light, unmodelled_of
 from dolens.errors import InputError
 from dolens.experiments.poses.estimates import Held, estimates, probability
 from dolens.optimize.damped_least_squares import DampedLeastSquares

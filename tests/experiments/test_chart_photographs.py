@@ -15,7 +15,7 @@ import dolens
 from dolens.alignment.chart import Chart
 from dolens.alignment.chart_fit import fit_chart
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
-from dolens.alignment.spot_intercepts import one_thread
+from dolens.alignment.spot_moments import one_thread
 from dolens.experiments.poses.chart_simulation import drawn, simulated
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.run_settings import RunSettings

@@ -26,7 +26,7 @@ from dolens.rendering.auto.choice import Choice
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 from tests.experiments.run_tables import rows_of

@@ -14,7 +14,7 @@ from dolens.experiments.camera.lens_least_squares import CameraOptimizer, LensLe
 from dolens.experiments.running.training import run
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription, load_lens
-from dolens.reconstruction.linear_bound import linear_error, natural_spectrum
+from dolens.reconstruction.wiener import linear_error, natural_spectrum
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY, TINY_DOUBLET, TINY_NETWORK
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=2"]

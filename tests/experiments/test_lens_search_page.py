@@ -5,7 +5,7 @@ import torch
 from dolens import load_lens
 from dolens.experiments.lens_search.finds import Course
 from dolens.experiments.lens_search.page import starts_and_designs
-from dolens.lens_search.found import FoundLens
+from dolens.lens_search.forms import FoundLens
 
 
 def test_starts_and_designs_of_a_form_are_counted():

@@ -20,7 +20,7 @@ from dolens.experiments.pretraining.traced_pupils import (
     fitted_pupils,
     within_tolerances,
 )
-from dolens.packaged import packaged_configuration
+from dolens.files import packaged_configuration
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.planar import PlanarScene

@@ -26,7 +26,7 @@ from dolens.experiments.callbacks.progress.state import (
     clock_text,
     speed_text,
 )
-from dolens.stages import stage
+from dolens.tasks import stage
 
 SOME = Snapshot(
     "fit", 30, 120, "epoch 2 of 6", {"train/loss": 0.0123456, "val/psnr_db": 24.5}, 3.4, 65.0

@@ -9,7 +9,7 @@ from dolens.errors import InputError
 from dolens.experiments.callbacks.starvation import StarvationWarning
 from dolens.experiments.running import threads
 from dolens.experiments.running.threads import set_threads
-from dolens.processors import ThreadTimes
+from dolens.threads import ThreadTimes
 
 
 class Clock:

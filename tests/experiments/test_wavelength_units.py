@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from dolens import InputError, Rays, load_lens
 from dolens.alignment.chart import Chart
-from dolens.alignment.chart_rays import ChartRays
+from dolens.alignment.chart_model import ChartRays
 from dolens.cli.app import app
 from dolens.experiments.poses.bench import Bench
 from dolens.experiments.settings import PupilRays, Spots

@@ -25,10 +25,9 @@ from dolens.experiments.design.tables import spot_table
 from dolens.experiments.settings import PupilRays, Spots
 from dolens.experiments.tolerances.tolerances import MonteCarlo, TolerancesModule
 from dolens.lens_page.offenders import offenders
-from dolens.lens_page.overview import lens_overview
-from dolens.lens_page.preparation import prepared_lens
+from dolens.lens_page.overview import lens_overview, prepared_lens
 from dolens.lens_page.sections import PageSections
-from dolens.lens_search.sensitivity import lens_sensitivity
+from dolens.lens_search.form_report import lens_sensitivity
 from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.fields import Fields
 from dolens.optimize import DesignVariables, MeritSettings

@@ -17,8 +17,7 @@ from dolens.experiments.running.configuration import checked
 from dolens.experiments.workers import workers_of
 from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.experiments.workers.ray_workers import RayWorkers
-from dolens.stages import listening
-from dolens.tasks import TaskError, in_turn
+from dolens.tasks import TaskError, in_turn, listening
 from dolens.tolerancing import tolerances_from, trace_perturbed
 
 # To import it would settle its mode of authentication.

@@ -11,7 +11,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf, open_dict
 
-from dolens.alignment.photograph import read_measurements
+from dolens.alignment.measurement import read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import unmodelled_of
 from dolens.errors import InputError

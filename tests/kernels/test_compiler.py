@@ -20,7 +20,7 @@ from numba.core import config
 
 from dolens.kernels.cpu import compiler, kernel_files, machine_code
 from dolens.kernels.cpu.plane import clip
-from dolens.stages import listening
+from dolens.tasks import listening
 
 PROGRAM = """
 import logging, sys

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dolens.analysis.conditions import conditions
-from dolens.lens_page.blocked_areas import blocked_sheets, edge_points
-from dolens.lens_page.solid import solid
+from dolens.lens_page.solid import blocked_sheets, edge_points, solid
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.prescriptions import lens_from_prescription
 

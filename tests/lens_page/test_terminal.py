@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from dolens import InputError, load_lens
 from dolens.cli.app import app
-from dolens.lens_page.states_table import states_table
+from dolens.lens_page.overview import states_table
 
 
 def show(*arguments):

@@ -9,17 +9,15 @@ import torch
 from dolens.analysis.parabasal import parabasal_rays
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.designed_lens import designed_lens
-from dolens.lens_search.designs import Designs
+from dolens.lens_search.designs import Designs, designed_lens
 from dolens.lens_search.form_coordinates import lens_arrays
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.neighbours import inserted, taken_out
-from dolens.lens_search.sags import asphere_slopes, sags
+from dolens.lens_search.operands import asphere_slopes, sags
+from dolens.lens_search.paraxial import Tangents
 from dolens.lens_search.search import SearchPlan, Stage, grown_starts
 from dolens.lens_search.search_rays import half_pupil
 from dolens.lens_search.specification import Limits, Specification
-from dolens.lens_search.starts import random_starts
-from dolens.lens_search.tangents import Tangents
+from dolens.lens_search.starts import inserted, random_starts, taken_out
 from dolens.optics.surfaces.clear_aperture import Circle
 
 # Two plastic lenses of a small camera; the first is spherical in front of its cemented neighbour.

@@ -12,13 +12,13 @@ from dolens.errors import InputError
 from dolens.lens_search.forms import (
     TOLERANCE,
     FormArrays,
+    FoundLens,
     distinct,
     form_coordinates,
     form_distances,
     form_numbers,
     lens_distance,
 )
-from dolens.lens_search.found import FoundLens
 from dolens.optics.paraxial import first_order
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optimize import DampedLeastSquares

@@ -9,17 +9,19 @@ import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.lens_search.course import search_course
-from dolens.lens_search.files import SUFFIXES, write_form
-from dolens.lens_search.form_report import report_form
-from dolens.lens_search.form_words import element_powers, glasses_text, powers_text
-from dolens.lens_search.forms import distinct
-from dolens.lens_search.found import FoundLens
+from dolens.lens_search.form_report import (
+    SUFFIXES,
+    element_powers,
+    glasses_text,
+    lens_sensitivity,
+    powers_text,
+    report_form,
+    write_form,
+)
+from dolens.lens_search.forms import FoundLens, distinct
 from dolens.lens_search.page import Pictures
-from dolens.lens_search.requirements import Requirements
-from dolens.lens_search.results import sections_figure, write_page
-from dolens.lens_search.sensitivity import lens_sensitivity
-from dolens.lens_search.start_map import start_map
+from dolens.lens_search.search_report import search_course, sections_figure, start_map, write_page
+from dolens.lens_search.verification import Requirements
 
 VOID = {"meta", "br", "hr", "img", "input", "link"}
 

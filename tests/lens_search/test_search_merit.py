@@ -9,14 +9,14 @@ import torch
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import AIR, STOP, Arrangement
-from dolens.lens_search.designed_lens import designed_lens
+from dolens.lens_search.designs import designed_lens
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.neighbours import inserted, taken_out
 from dolens.lens_search.paraxial import numbers_of, paraxial
 from dolens.lens_search.real_beams import real_beams
 from dolens.lens_search.real_pupils import with_real_beams
 from dolens.lens_search.search_rays import half_pupil
 from dolens.lens_search.specification import Limits, Specification
+from dolens.lens_search.starts import inserted, taken_out
 
 QUARTET = Specification(
     focal_length=100.0,

@@ -10,9 +10,8 @@ import torch
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.lens_search.real_beams import real_beams, spaces, with_drawn_heights
-from dolens.lens_search.requirements import Requirements
 from dolens.lens_search.specification import Limits, Specification
-from dolens.lens_search.verification import Check, verify
+from dolens.lens_search.verification import Check, Requirements, verify
 from dolens.optics.surfaces.clear_aperture import Circle
 from dolens.optimize.operands import LensProperties, operand
 from dolens.prescriptions import lens_from_prescription

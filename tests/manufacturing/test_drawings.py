@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from dolens import load_lens
 from dolens.cli.app import app
 from dolens.errors import InputError
-from dolens.manufacturing.assembly_sheet import assembly_sheets
 from dolens.manufacturing.drawing_numbers import (
     coefficient_rows,
     material_rows,
@@ -22,10 +21,10 @@ from dolens.manufacturing.drawing_numbers import (
     sag_rows,
 )
 from dolens.manufacturing.drawing_sheet import TitleBlock
-from dolens.manufacturing.drawings import drawing_figures, export_drawings
+from dolens.manufacturing.drawings import assembly_sheets, drawing_figures, export_drawings
 from dolens.manufacturing.element_sheet import element_sheet
 from dolens.manufacturing.glass_elements import glass_elements
-from dolens.manufacturing.lens_file_export import export_lens_file
+from dolens.manufacturing.lens_export import export_lens_file
 from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances, read_tolerances
 from dolens.prescriptions import lens_from_prescription
 

@@ -12,11 +12,8 @@ from dolens.errors import InputError
 from dolens.manufacturing import modeller
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.lens_export import export_lens
-from dolens.manufacturing.sag_errors import sag_errors
-from dolens.manufacturing.solids import element_solid
-from dolens.manufacturing.solids_picture import triangles, visible
-from dolens.manufacturing.step import export_step, product_name
-from dolens.manufacturing.step_file import read_step_file
+from dolens.manufacturing.solids import element_solid, triangles, visible
+from dolens.manufacturing.step import export_step, product_name, read_step_file, sag_errors
 from dolens.prescriptions import lens_from_prescription
 
 GLASS = "1.5168/64.17"

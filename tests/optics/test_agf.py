@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.file_text import decode_text
+from dolens.files import decode_text
 from dolens.optics.agf import internal_transmittance, parse_agf, read_entry
 
 # Name, formula, nd as printed, coefficients, range: one glass of each formula that catalogues use.

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dolens import InputError, load_lens, save_lens
-from dolens.file_text import decode_text
+from dolens.files import decode_text
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of

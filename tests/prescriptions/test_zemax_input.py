@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dolens import InputError
-from dolens.file_text import decode_text
+from dolens.files import decode_text
 from tests.prescriptions.samples import require_refused
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
 

@@ -7,7 +7,7 @@ from torchvision.models import googlenet, mobilenet_v2
 
 from dolens.errors import InputError
 from dolens.reconstruction import Backbone, PretrainedWeightsUnavailable, load_backbone
-from dolens.reconstruction.backbone_architectures import ARCHITECTURES
+from dolens.reconstruction.backbones import ARCHITECTURES
 
 MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
 DEVIATION = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)

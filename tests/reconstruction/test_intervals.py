@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import t as student_t
 
-from dolens.reconstruction.intervals import bootstrap_interval, gain_interval
+from dolens.reconstruction.quality import bootstrap_interval, gain_interval
 
 
 def first(means):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dolens.reconstruction.linear_bound import linear_error, natural_spectrum
+from dolens.reconstruction.wiener import linear_error, natural_spectrum
 
 SIDE = 64
 

@@ -13,7 +13,7 @@ from dolens.reconstruction import (
     PretrainedWeightsUnavailable,
     VGG16Features,
     load_vgg16_weights,
-    perceptual,
+    losses,
     perceptual_loss,
     torchvision_weights,
 )
@@ -135,7 +135,7 @@ def test_a_server_that_never_answers_is_given_up(torch_cache, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/{FILE_NAME}"
         monkeypatch.setenv("no_proxy", "127.0.0.1")
-        monkeypatch.setattr(perceptual, "VGG16", replace(perceptual.VGG16, url=url))
+        monkeypatch.setattr(losses, "VGG16", replace(losses.VGG16, url=url))
         monkeypatch.setattr(torchvision_weights, "DOWNLOAD_TIMEOUT_S", 0.2)
         monkeypatch.setattr(torch.hub, "download_url_to_file", REAL_DOWNLOAD)
         with pytest.raises(PretrainedWeightsUnavailable, match="timed out"):

@@ -9,10 +9,10 @@ from torch import distributed, nn
 
 from dolens.experiments.camera.adversary import Adversary
 from dolens.reconstruction.adversarial import (
+    PatchDiscriminator,
     RelativisticDiscriminators,
     relativistic_discriminator_loss,
 )
-from dolens.reconstruction.discriminators import PatchDiscriminator
 from dolens.reconstruction.processes import (
     average_gradients,
     gathered,

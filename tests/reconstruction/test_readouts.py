@@ -8,10 +8,9 @@ import torch
 
 from dolens.errors import InputError
 from dolens.reconstruction import GeneralRestoration, WienerTVRestoration
-from dolens.reconstruction.depth_choice import depth_probabilities
 from dolens.reconstruction.general import prepared
-from dolens.reconstruction.motion import estimated_motion
-from dolens.reconstruction.readouts import readouts_of, shifted
+from dolens.reconstruction.likelihood import depth_probabilities, estimated_motion
+from dolens.reconstruction.wiener import readouts_of, shifted
 from dolens.sensor.colour import linear_to_srgb
 
 SHOT, READ = 0.01, 4e-4

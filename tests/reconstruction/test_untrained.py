@@ -10,8 +10,7 @@ import torch
 from dolens.errors import InputError
 from dolens.reconstruction import WienerBM3DRestoration, WienerTVRestoration, psnr_db
 from dolens.reconstruction.opponent_wiener import colour_filters, correlations
-from dolens.reconstruction.untrained import noise_power, resampled_spectrum
-from dolens.reconstruction.variance_stabilising import VarianceStabiliser
+from dolens.reconstruction.untrained import VarianceStabiliser, noise_power, resampled_spectrum
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 

@@ -5,7 +5,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.scene.planar import PlanarScene, pinhole_image
-from dolens.scene.texture import bilinear
+from dolens.scene.scene import bilinear
 from dolens.sensor.pixels import Sensor
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare
 from dolens.sensor.readout import Readout
 
 READOUTS = {

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.sensor.bayer import PATTERNS, demosaic, mosaic
+from dolens.sensor.colour import PATTERNS, demosaic, mosaic
 
 SIZES = [(3, 3), (4, 6), (5, 4), (7, 9)]
 

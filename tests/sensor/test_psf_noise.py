@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dolens.sensor.psf_noise import noisy_point_spread_functions
+from dolens.sensor.noise import noisy_point_spread_functions
 
 
 def test_a_measured_function_has_poisson_s_spread_about_the_true_one():

@@ -8,7 +8,7 @@ import scipy.stats
 import torch
 
 from dolens.errors import InputError
-from dolens.sensor.bayer import mosaic
+from dolens.sensor.colour import mosaic
 from dolens.sensor.noise import add_read_noise, add_shot_noise, shot_noise_deviation
 from dolens.sensor.readout import Readout, quantise
 

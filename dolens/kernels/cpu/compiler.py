@@ -24,7 +24,7 @@ from numba.extending import intrinsic
 
 from dolens.kernels.cpu import machine_code
 from dolens.kernels.cpu.kernel_files import KernelFiles
-from dolens.stages import stage
+from dolens.tasks import stage
 
 logger = logging.getLogger("dolens.kernels")
 

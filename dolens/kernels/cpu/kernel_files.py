@@ -25,8 +25,8 @@ import llvmlite
 import numba
 from numba.core import config
 
+from dolens.files import delete_old, user_cache_folder, write_whole
 from dolens.kernels.cpu.machine_code import MachineCode
-from dolens.user_cache import delete_old, user_cache_folder, write_whole
 
 logger = logging.getLogger("dolens.kernels")
 

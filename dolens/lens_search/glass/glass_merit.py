@@ -12,16 +12,15 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.lens_search.arrangement import AIR
-from dolens.lens_search.conditions import Conditions
-from dolens.lens_search.glass.dispersion_coordinates import material_text
-from dolens.lens_search.glass.drawn_glasses import drawn_glasses
-from dolens.lens_search.glass.glass_set import GlassSet
-from dolens.lens_search.glass.own_glasses import FREE, HELD, FamilyOfGlasses
-from dolens.lens_search.glass.region import GlassRegion
+from dolens.lens_search.arrangement import AIR, Arrangement
+from dolens.lens_search.glass.choice import GlassSet, chosen_glasses
+from dolens.lens_search.glass.dispersion_coordinates import GlassRegion, material_text
+from dolens.lens_search.glass.glass_family import FREE, HELD, FamilyOfGlasses
+from dolens.lens_search.glass.thin_achromats import drawn_glasses
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.paraxial import LensNumbers, Paraxial, numbers_of, paraxial
-from dolens.lens_search.tangents import Tangents
+from dolens.lens_search.paraxial import LensNumbers, Paraxial, Tangents, numbers_of, paraxial
+from dolens.lens_search.search_rays import Conditions, search_rays
+from dolens.lens_search.specification import Specification
 from dolens.optimize.batch_least_squares import BatchModel
 
 # Of the distance beyond a wall of the region of existing glasses, in the coordinates' units, beside
@@ -256,3 +255,39 @@ class GlassMerit(SearchMerit):
             here = slice(first + glass * count, first + (glass + 1) * count)
             hessian[:, here, here] += block
         return BatchModel(model.merit + hinges.square().sum((1, 2)), gradient, hessian)
+
+
+def merit_of(
+    arrangement: Arrangement,
+    specification: Specification,
+    rings: int = 4,
+    arms: int = 8,
+    free: bool = True,
+) -> SearchMerit:
+    """Return the merit with rays of that many rings and arms.
+
+    Args:
+        arrangement: the order of elements.
+        specification: with a choice of glasses, lenses have glasses of their own.
+        rings: of the pupil.
+        arms: of its half.
+        free: whether chosen glasses may vary.
+
+    Raises:
+        InputError: no glass is left to choose.
+    """
+    if specification.glass_choice is None:
+        return SearchMerit.of(arrangement, specification, rings, arms)
+    glasses = chosen_glasses(specification.glass_choice, tuple(specification.wavelengths))
+    rays = search_rays(specification, rings, arms)
+    return GlassMerit(arrangement, specification, rays, glasses=glasses, free=free)
+
+
+def with_glasses_of(
+    arrangement: Arrangement, specification: Specification, values: Tensor
+) -> Specification:
+    """Return the specification with the glasses of one design u, (N,), and nothing to choose."""
+    merit = merit_of(arrangement, specification, 1, 1)
+    if not isinstance(merit, GlassMerit):
+        return specification
+    return replace(specification, glasses=merit.materials(values[None]), glass_choice=None)

@@ -3,19 +3,34 @@
 The glasses of a form become continuous and are optimised with the lens, as `finish` does it, until
 operands hold.  Then they are snapped and exchanged (see `snapping`), and the lenses that come of it
 are finished with their glasses held.
+
+How much a lens expects of other glasses is a quadratic model from its residuals' Jacobian.  With
+residuals r and the Jacobian J with respect to everything, variables and coordinates of all
+glasses, the squared merit near a design is |r + J s|².  For one glass moved by δ, the step of all
+that is free is the one that makes this smallest (a Schur complement), and what remains is
+2 b·δ + δ·H δ.
 """
 
 from dataclasses import dataclass, field
 
 import torch
+from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.lens_search.designs import Designs
+from dolens.lens_search.glass.glass_family import FREE
 from dolens.lens_search.glass.glass_merit import GlassMerit
-from dolens.lens_search.glass.reoptimisation import free_trials, reoptimiser
 from dolens.lens_search.glass.snapping import snap_glasses
-from dolens.lens_search.glass.trial_glasses import SnapSettings
+from dolens.lens_search.glass.trial_glasses import (
+    GlassModel,
+    GlassTrials,
+    Reoptimise,
+    Reoptimised,
+    SnapSettings,
+)
 from dolens.lens_search.growth import Grown, finish, settled
+from dolens.lens_search.search_rays import Conditions
+from dolens.optimize.batch_least_squares import BatchModel, minimise_batch
 
 
 @dataclass(frozen=True)
@@ -122,3 +137,124 @@ def with_real_glasses(
         spots = again.merit.spots(again.values, again.conditions).mean(-1)
         continuous, used = min(continuous, float(spots)), used + again.iterations
     return RealGlasses(designs, continuous, found.trials, used)
+
+
+# A free glass this near to a wall leans on it, and a variable this near to a bound on that.
+_NEAR_WALL, _NEAR_BOUND = 1e-2, 1e-9
+# Lenses evaluated together: their arrays then stay in the processor's cache.
+_AT_A_TIME = 512
+
+
+def reoptimiser(
+    merit: GlassMerit, conditions: Conditions, iterations: int, merit_tolerance: float = 1e-4
+) -> Reoptimise:
+    """Return the callback of `snap_glasses` for lenses of a search.
+
+    What is made small is Σ ω·spot² with operands and walls, and the merit that is returned is the
+    mean of the spots over the focal length, as that of a search is.  The rest of the augmented
+    Lagrangian, without what shifts add where operands hold, counts as such an increase of the mean:
+    with ω ~ 1/spot, d(mean) is d(Σ ω·spot²)·mean(1/spot)/2.
+
+    Args:
+        merit: of lenses and glasses.
+        conditions: of L lenses; a trial's lens is its number among them.
+        iterations: of damped least squares at most.
+        merit_tolerance: see `minimise_batch`.
+    """
+    shifted = merit.operand_weight**2 * conditions.shifts.square().sum(1)
+
+    def run(trials: GlassTrials) -> Reoptimised:
+        u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)
+        asked = conditions.chosen(trials.lens)
+        lower, upper = merit.box(u)
+
+        def evaluate(which: Tensor, values: Tensor) -> BatchModel:
+            parts = zip(which.split(_AT_A_TIME), values.split(_AT_A_TIME), strict=True)
+            return BatchModel.joined([merit.evaluate(v, asked.chosen(w)) for w, v in parts])
+
+        found = minimise_batch(evaluate, u, lower, upper, iterations, merit_tolerance)
+        at = found.values
+        optical = merit.optical(at, asked)
+        coordinates = merit.coordinates(at)
+        free = (at > lower + _NEAR_BOUND) & (at < upper - _NEAR_BOUND)
+        leaning = (merit.region.excess(coordinates) > -_NEAR_WALL).any(-1, keepdim=True)
+        first = merit.arrangement.variables
+        last = first + coordinates[0].numel()
+        free[:, first:last] &= ~leaning.expand_as(coordinates).flatten(1)
+        usable = torch.isfinite(found.merit)
+        hessian, gradient = optical.hessian[:, :last, :last], optical.gradient[:, :last]
+        model = glass_models(
+            torch.where(usable[:, None, None], hessian, 0.0),
+            torch.where(usable[:, None], gradient, 0.0),
+            free[:, :last],
+            merit.shape,
+        )
+        spots = merit.spots(at, asked) / merit.specification.focal_length
+        square = (asked.field_weights * spots.square()).sum(1)
+        rest = found.merit - shifted[trials.lens] - square
+        mean = spots.mean(1)
+        whole = mean + 0.5 * rest * (1.0 / spots.clamp(min=1e-12)).mean(1)
+        # The model is of the squared merit, in its own unit.
+        unit = (mean.square() / square.clamp(min=1e-30)).nan_to_num(1.0)[:, None, None]
+        model = GlassModel(unit * model.slopes, unit[..., None] * model.curvatures)
+        whole = torch.where(usable, whole.clamp(min=0.0), torch.inf)
+        return Reoptimised(whole, at[:, :first], coordinates, model)
+
+    return run
+
+
+def free_trials(merit: GlassMerit, u: Tensor) -> GlassTrials:
+    """Return lenses u as trials, in their order, whose glasses vary."""
+    return GlassTrials(
+        torch.arange(len(u)),
+        u[:, : merit.arrangement.variables],
+        merit.coordinates(u),
+        torch.full_like(merit.numbers(u), FREE),
+    )
+
+
+# Share of the largest diagonal element added to what is eliminated, which may be singular.
+_RIDGE = 1e-12
+
+
+def glass_models(
+    gram: Tensor, gradient: Tensor, free: Tensor, shape: tuple[int, int]
+) -> GlassModel:
+    """Return the model of each glass of a batch of designs.
+
+    Args:
+        gram: JᵀJ, (T, N, N), of N = V + G C unknowns, those of the glasses last.
+        gradient: Jᵀr, (T, N).
+        free: (T, N), which unknowns are optimised again when a glass moves; those of the glass
+            itself are never, and variables at a bound had better not be.
+        shape: G and C.
+    """
+    glasses, count = shape
+    first = gram.shape[-1] - glasses * count
+    slopes, curvatures = [], []
+    for glass in range(glasses):
+        own = torch.zeros_like(free[0])
+        own[first + glass * count : first + (glass + 1) * count] = True
+        others = free & ~own
+        slope, curvature = _eliminated(gram, gradient, own, others)
+        slopes.append(slope)
+        curvatures.append(curvature)
+    return GlassModel(torch.stack(slopes, 1), torch.stack(curvatures, 1))
+
+
+def _eliminated(
+    gram: Tensor, gradient: Tensor, own: Tensor, others: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return gradient and Gram matrix of one glass with the free others eliminated."""
+    mask = others.to(gram)
+    diagonal = gram.diagonal(dim1=1, dim2=2)
+    ridge = _RIDGE * (diagonal * mask).amax(1, keepdim=True) + torch.finfo(gram.dtype).tiny
+    # Rows and columns of what is held become those of the unit matrix.
+    among = gram * mask[:, :, None] * mask[:, None, :] + torch.diag_embed(
+        torch.where(others, ridge, torch.ones_like(mask))
+    )
+    across = gram[:, :, own] * mask[:, :, None]
+    right = torch.cat([across, (gradient * mask)[..., None]], dim=2)
+    solved = torch.linalg.solve(among, right)
+    change = across.transpose(1, 2) @ solved
+    return gradient[:, own] - change[..., -1], gram[:, own][:, :, own] - change[..., :-1]

@@ -20,7 +20,7 @@ from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
 from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values, WindowShare
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
-from dolens.stages import stage
+from dolens.tasks import stage
 
 logger = logging.getLogger(__name__)
 

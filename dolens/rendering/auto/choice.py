@@ -15,7 +15,7 @@ from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.sensor.pixels import Sensor
-from dolens.stages import stage
+from dolens.tasks import stage
 
 MODELS: Mapping[str, type[Renderer]] = {r.model: r for r in (PsfRenderer, RayRenderer)}
 

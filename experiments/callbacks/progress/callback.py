@@ -12,7 +12,7 @@ from dolens.errors import InputError
 from dolens.experiments.callbacks.photograph_names import shown_name
 from dolens.experiments.callbacks.progress.displays import Display, display_for, logger
 from dolens.experiments.callbacks.progress.state import MovingAverage, Snapshot, clock_text
-from dolens.stages import StageEvent, listening
+from dolens.tasks import StageEvent, listening
 
 # Seconds between looks at the metrics: each one waits for a GPU to be done.
 _LOOK_S = 0.1
@@ -24,7 +24,7 @@ class RunProgress(ProgressBar):
     """Shows how far a run is, what it does before its first step, and smoothed numbers.
 
     Displays: a bar in a terminal, a text in a notebook, lines of the log elsewhere.  Stages of the
-    library (`dolens.stages`), such as compiling kernels, are named while they last, and their time
+    library (`dolens.tasks`), such as compiling kernels, are named while they last, and their time
     is not that of a step.  `trainer.enable_progress_bar=false` takes all of it away.
 
     Args:

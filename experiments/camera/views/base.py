@@ -15,8 +15,7 @@ from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.scene import Scene
-from dolens.seeded_generators import generator_of
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare, generator_of
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 

@@ -30,10 +30,9 @@ from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import as_planes, pinhole_image
-from dolens.scene.scene import Scene
-from dolens.scene.texture import resized
-from dolens.sensor.batch_share import BatchShare
+from dolens.scene.scene import Scene, resized
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.noise import BatchShare
 from dolens.sensor.readout import Readout
 
 

@@ -22,10 +22,9 @@ from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.experiments.checks import check_positive
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state, values_there
-from dolens.reconstruction.motion import estimated_motion
-from dolens.reconstruction.readouts import shifted
-from dolens.seeded_generators import generator_of
-from dolens.sensor.batch_share import BatchShare
+from dolens.reconstruction.likelihood import estimated_motion
+from dolens.reconstruction.wiener import shifted
+from dolens.sensor.noise import BatchShare, generator_of
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 

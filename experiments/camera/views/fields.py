@@ -43,10 +43,9 @@ from dolens.rendering.ray_renderer import RayRenderer
 from dolens.rendering.relative_illumination import IlluminationMap
 from dolens.rendering.whole_field import window_side
 from dolens.scene.planar import PlanarScene, pinhole_image
-from dolens.scene.texture import resized
-from dolens.seeded_generators import generator_of
-from dolens.sensor.batch_share import BatchShare
+from dolens.scene.scene import resized
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.noise import BatchShare, generator_of
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 

@@ -11,8 +11,7 @@ from dolens.experiments.camera.views.depths import DepthViews
 from dolens.experiments.data.occluders import with_occluders
 from dolens.optics.lens import Lens
 from dolens.scene.layered import LayeredScene
-from dolens.seeded_generators import generator_of
-from dolens.sensor.batch_share import BatchShare
+from dolens.sensor.noise import BatchShare, generator_of
 
 
 class LayerViews(DepthViews):

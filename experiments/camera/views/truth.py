@@ -16,8 +16,7 @@ from dolens.rendering.pupil.differentiable_pupil import (
 )
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.scene.planar import as_planes
-from dolens.scene.scene import Scene
-from dolens.scene.texture import bilinear, texture_origin
+from dolens.scene.scene import Scene, bilinear, texture_origin
 from dolens.sensor.pixels import Sensor
 
 TRUTHS = ("pinhole", "chief_rays")

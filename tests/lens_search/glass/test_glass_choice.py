@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.lens_search.glass.choice import GlassChoice, choose_glasses
-from dolens.lens_search.glass.glass_set import glass_set
+from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_set
 from dolens.optics.glass_catalog import find_glass
 
 LINES = (486.1327, 587.5618, 656.2725)

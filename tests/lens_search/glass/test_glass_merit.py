@@ -7,13 +7,11 @@ import torch
 
 from dolens import InputError
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.glass.choice import GlassChoice, choose_glasses
-from dolens.lens_search.glass.designs import GlassTrials
+from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_set
 from dolens.lens_search.glass.glass_merit import GlassMerit
-from dolens.lens_search.glass.glass_set import glass_set
-from dolens.lens_search.glass.reoptimisation import reoptimiser
+from dolens.lens_search.glass.glass_step import reoptimiser
 from dolens.lens_search.glass.snapping import snap_glasses
-from dolens.lens_search.glass.trial_glasses import SnapSettings
+from dolens.lens_search.glass.trial_glasses import GlassTrials, SnapSettings
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.real_pupils import with_real_beams
 from dolens.lens_search.search_rays import search_rays

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.lens_search.glass.region import glass_region, nearest, pull, spread
+from dolens.lens_search.glass.dispersion_coordinates import glass_region, nearest, pull, spread
 
 SQUARE = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0], [1.0, 0.5]]).double()
 

@@ -6,15 +6,13 @@ import pytest
 import torch
 
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.glass.choice import GlassChoice
-from dolens.lens_search.glass.glass_merit import GlassMerit
-from dolens.lens_search.glass.glass_set import chosen_glasses
+from dolens.lens_search.glass.choice import GlassChoice, chosen_glasses
+from dolens.lens_search.glass.glass_family import FREE
+from dolens.lens_search.glass.glass_merit import GlassMerit, merit_of
 from dolens.lens_search.glass.glass_step import GlassPlan
-from dolens.lens_search.glass.own_glasses import FREE
 from dolens.lens_search.glass.thin_achromats import best_achromats
 from dolens.lens_search.glass.trial_glasses import SnapSettings
 from dolens.lens_search.growth import grow
-from dolens.lens_search.lens_merit import merit_of
 from dolens.lens_search.search import SearchPlan, Stage, search, with_step
 from dolens.lens_search.specification import Limits, Specification
 from dolens.lens_search.starts import random_starts

@@ -4,12 +4,10 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.lens_search.glass.choice import GlassChoice, choose_glasses
-from dolens.lens_search.glass.designs import GlassTrials, Reoptimised
-from dolens.lens_search.glass.glass_models import glass_models
-from dolens.lens_search.glass.glass_set import glass_set
+from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_set
+from dolens.lens_search.glass.glass_step import glass_models
 from dolens.lens_search.glass.snapping import snap_glasses
-from dolens.lens_search.glass.trial_glasses import SnapSettings
+from dolens.lens_search.glass.trial_glasses import GlassTrials, Reoptimised, SnapSettings
 from tests.lens_search.glass import thin_lens_colour as thin
 
 LINES = (656.2725, 587.5618, 546.074, 486.1327, 435.8343)

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.lens_search.glass.choice import GlassChoice, choose_glasses
-from dolens.lens_search.glass.glass_set import glass_set
+from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_set
 from dolens.lens_search.glass.thin_achromats import _seidel, best_achromats, thin_achromats
 from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.seidel import seidel

@@ -9,8 +9,8 @@ from itertools import combinations
 
 import torch
 
-from dolens.lens_search.glass.designs import GlassTrials, Reoptimised
-from dolens.lens_search.glass.glass_models import glass_models
+from dolens.lens_search.glass.glass_step import glass_models
+from dolens.lens_search.glass.trial_glasses import GlassTrials, Reoptimised
 
 # A power that is off by this costs 1; so does a curvature of 1/STRENGTH.
 POWER, STRENGTH = 3e-4, 0.05

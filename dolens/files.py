@@ -1,14 +1,20 @@
-"""Files that a user or a stranger names are read and decoded, whatever system wrote them.
+"""Files: what a user names is read and decoded, results are written whole or not at all, and what
+can be made anew is kept in a cache; versions and configuration come with the installation.
 
-Paths that they name are looked at before anything is done with them.
+Paths that files name are looked at before anything is done with them.
 """
 
 import codecs
 import gc
 import os
+import shutil
 import stat
+import sys
+import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import metadata
 from pathlib import Path
 from unicodedata import category
 
@@ -167,3 +173,112 @@ def decode_text(data: bytes, where: str) -> str:
     if "\0" in text:
         raise InputError(f"{where}: is no text (allowed: UTF-16, UTF-8 or Latin-1)")
     return text
+
+
+# Of what is being written, or was when its process was killed.
+UNFINISHED = ".part"
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a path to write to, and put what was written in its place when the block ends.
+
+    A full disk, an error in the block or the end of the process leaves the file that was there
+    before.  What was written is on the disk, and no longer only on its way there, before it takes
+    the place of the other.
+
+    Args:
+        path: of the file; its folder exists.
+
+    Yields:
+        The path to write to, in the same folder, since only there a file is replaced at once.
+
+    Raises:
+        OSError: the file cannot be written, as on a full disk.
+    """
+    aside = path.with_name(path.name + UNFINISHED)
+    try:
+        yield aside
+        with aside.open("rb+") as file:
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except BaseException as error:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
+        # What the user asked for; an error as of a full disk, amid writing, has no name at all.
+        if isinstance(error, OSError) and error.filename in (None, str(aside)):
+            error.filename, error.filename2 = str(path), None
+        raise
+
+
+# Days after which what nothing was added to is deleted.
+_KEPT_DAYS = 90.0
+
+
+def user_cache_folder() -> Path:
+    """Return `dolens` in the user's cache folder.
+
+    That is XDG_CACHE_HOME or ~/.cache on Linux, ~/Library/Caches on macOS, LOCALAPPDATA on Windows.
+
+    Raises:
+        RuntimeError: the user has no home folder.
+    """
+    if sys.platform == "win32":
+        of_user = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        of_user = Path.home() / "Library" / "Caches"
+    else:
+        # The convention says that a relative path is to be passed over.
+        of_user = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        of_user = of_user if of_user.is_absolute() else Path.home() / ".cache"
+    return Path(of_user) / "dolens"
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that other processes see whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def delete_old(folder: Path) -> None:
+    """Delete the files and folders in a folder that nobody has changed for months."""
+    oldest = time.time() - _KEPT_DAYS * 86400.0
+    for entry in folder.iterdir():
+        if entry.stat().st_mtime >= oldest:
+            continue
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
+
+
+def packaged_configuration() -> Path:
+    """Return the folder of the configuration that comes with dolens.
+
+    It is `dolens/conf`, which in a checkout of the repository is a link to `conf`.  Its subfolders
+    are the groups: `lens`, `experiment`, `network`, …
+
+    Raises:
+        InputError: the folder is not there: the installation is not complete.
+    """
+    folder = (Path(__file__).resolve().parent / "conf").resolve()
+    if not (folder / "train.yaml").is_file():
+        raise InputError(
+            f"the configuration of dolens is missing: no train.yaml in {folder}; "
+            "install dolens again"
+        )
+    return folder
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of an installed package; None where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from dolens.kernels.variable_map import VariableMap
 from dolens.lens_search.arrangement import AIR, Arrangement
-from dolens.lens_search.glass.glass_set import GlassSet
+from dolens.lens_search.glass.choice import GlassSet
 from dolens.optics.lens_family import FamilyJacobian, FamilyRays, FamilySums, LensFamily
 from dolens.optics.rays import TracedRays
 
