@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.made_lens_scores import worst_decile
 from dolens.plotting import save_figure
-from dolens.plotting.made_front import made_front_figure
+from dolens.plotting.tolerances import made_front_figure
 
 _RESAMPLES, _ENDS = 2000, (0.025, 0.975)
 

@@ -28,7 +28,7 @@ from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import format_interval
 from dolens.experiments.data.package_photographs import data_folders
 from dolens.plotting import save_figure
-from dolens.plotting.coding_gain import GainRange, coding_gain_figure
+from dolens.plotting.pareto import GainRange, coding_gain_figure
 from scripts.coding.cameras import (
     F_NUMBERS,
     Bound,

@@ -95,7 +95,7 @@ def main() -> None:
     if not only_table:
         from dolens import load_lens
         from dolens.plotting import save_figure
-        from dolens.plotting.lens_sheet import lens_sheet_figure
+        from dolens.plotting.small_sections import lens_sheet_figure
 
         lenses = {name.partition("/")[2]: load_lens(name) for name in published_lens_names()}
         save_figure(lens_sheet_figure(lenses), PICTURE)

@@ -20,7 +20,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.plotting import save_figure
-from dolens.plotting.quality_over_time import quality_figure
+from dolens.plotting.runs import quality_figure
 from dolens.reconstruction import Restoration
 from scripts.reconstruction.fixed_optics import FixedOptics, composed_network, fixed_optics
 from scripts.reconstruction.known_depth import known_depth

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.text import Text
 
 from dolens import load_lens
-from dolens.plotting.lens_sheet import lens_sheet_figure
+from dolens.plotting.small_sections import lens_sheet_figure
 from dolens.prescriptions import published_lens_names
 
 ROOT = Path(__file__).resolve().parents[1]

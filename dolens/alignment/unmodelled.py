@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.diffraction.field import fourier_field
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.propagation import fourier_field
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError

@@ -9,9 +9,13 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import FieldPoints, conditions
-from dolens.analysis.first_order_numbers import FirstOrderNumbers, first_order_numbers
+from dolens.analysis.paraxial_data import (
+    ABERRATIONS,
+    FirstOrderNumbers,
+    first_order_numbers,
+    seidel_sums,
+)
 from dolens.analysis.ray_intercepts import in_double_precision
-from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.optics.fields import point_text, weights_text
 from dolens.optics.lens import Lens

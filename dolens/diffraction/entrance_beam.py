@@ -1,4 +1,10 @@
-"""The rays of an object point that pass a lens, as seen from its front.
+"""Object points, near and infinitely far, and the light and rays that they send into a lens.
+
+The light that object points send into a lens, relative to a point on the axis.
+
+The points belong to a Lambertian plane perpendicular to the axis, so that what a lens passes of
+them falls off as cos⁴ of the field angle where nothing clips the light and the entrance pupil does
+not change.
 
 A ray of a given object point is fixed by where it crosses the plane through the first vertex that
 faces the point (see `dolens.optics.launching`).  Tracing costs so little that the part of this
@@ -7,19 +13,163 @@ this asks nothing of the pupil's shape and place.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.errors import InputError
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.launching import launch, line_of_slopes
-from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.paraxial import entrance_pupil, matrix_to_stop
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays
 from dolens.optics.system import OpticalSystem
+
+
+@dataclass(frozen=True)
+class ObjectPoints:
+    """N points, each by the line from it to the first vertex and by one over its distance.
+
+    So a point at infinity is like any other, and a far one brings no large number into path
+    lengths.
+
+    Attributes:
+        slopes: (N, 2), the line from the point to the first vertex has direction
+            (slope x, slope y, 1), normalised.
+        vergence: (N,), 1/mm, one over the point's distance -z in front of the first vertex; zero
+            at infinity.
+    """
+
+    slopes: Tensor
+    vergence: Tensor
+
+    def __post_init__(self) -> None:
+        if self.slopes.ndim != 2 or self.slopes.shape != (*self.vergence.shape, 2):
+            raise InputError(
+                f"object points need slopes (N, 2) and vergences (N,), not "
+                f"{tuple(self.slopes.shape)} and {tuple(self.vergence.shape)}"
+            )
+
+    @staticmethod
+    def at_infinity(fields: Sequence[Sequence[float]] | Tensor) -> "ObjectPoints":
+        """Infinitely far points of fields (N, 2) in degrees.
+
+        Light of field (x, y) travels along (tan x, tan y, 1), as `Lens.aim` takes it.
+
+        Raises:
+            InputError: fields that are not pairs, or not between -90° and 90°.
+        """
+        fields = _pairs(fields, 2, "fields must be pairs (x, y) in degrees, at least one")
+        if not bool((fields.detach().abs() < 90.0).all()):
+            raise InputError("fields at infinity must lie between -90 and 90 degrees")
+        slopes = torch.deg2rad(fields).tan()
+        return ObjectPoints(slopes, torch.zeros_like(slopes[:, 0]))
+
+    @staticmethod
+    def at(positions: Sequence[Sequence[float]] | Tensor) -> "ObjectPoints":
+        """Points (N, 3), mm in the lens's axes; z is negative, -inf only on the axis.
+
+        Raises:
+            InputError: positions that are not triples, or not in front of the first vertex.
+        """
+        positions = _pairs(positions, 3, "object points must be (x, y, z) in mm, at least one")
+        z = positions[:, 2]
+        if not bool((z.detach() < 0.0).all()):
+            raise InputError("object points must lie in front of the first vertex: z < 0")
+        return ObjectPoints(positions[:, :2] / z[:, None], -1.0 / z)
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.vergence)
+
+    def __getitem__(self, which: Tensor) -> "ObjectPoints":
+        """The points that an index or a mask chooses."""
+        return ObjectPoints(self.slopes[which], self.vergence[which])
+
+    def to(self, dtype: torch.dtype, device: torch.device) -> "ObjectPoints":
+        """The same points in another precision or elsewhere."""
+        return ObjectPoints(
+            self.slopes.to(device=device, dtype=dtype), self.vergence.to(device=device, dtype=dtype)
+        )
+
+
+def _pairs(values: Sequence[Sequence[float]] | Tensor, count: int, message: str) -> Tensor:
+    if not isinstance(values, Tensor) or not values.is_floating_point():
+        values = torch.as_tensor(values, dtype=torch.float64)
+    if values.ndim != 2 or values.shape[-1] != count or len(values) == 0:
+        raise InputError(f"{message}, not {tuple(values.shape)}")
+    return values
+
+
+def flux_density(points: ObjectPoints, q: Tensor, n: Tensor) -> Tensor:
+    """Flux per area of the plane through the first vertex that faces the point.
+
+    A point at distance D = 1/w sends cos θ·dΩ into dΩ = D·d²q/(D² + q²)^(3/2).  Times the square of
+    the object plane's distance, which makes it finite for a plane at infinity, this is
+
+        c²·n·(1 + w²q²)^(-3/2) d²q,
+
+    with c the cosine between the line to the first vertex and the axis, and n = cos θ the ray's.
+
+    Args:
+        points: N of them.
+        q: (N, S, S, 2), mm.
+        n: (N, S, S), cosine between the rays before the lens and the axis.
+
+    Returns:
+        (N, S, S).
+    """
+    cosine = torch.rsqrt(1.0 + points.slopes.square().sum(-1))
+    w = (cosine * points.vergence)[:, None, None]
+    spread = 1.0 + w * w * q.square().sum(-1)
+    return cosine.square()[:, None, None] * n * spread.pow(-1.5)
+
+
+def axial_flux(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> Tensor:
+    """Flux of the axial point of each point's object plane through the paraxial entrance pupil.
+
+    π·z²·sin²u in units of `flux_density`, with z the object's distance and u the slope of the
+    marginal ray there: tan u = r/(A·z + n·B), r the stop's semi-diameter and [[A, B], [C, D]] the
+    paraxial matrix to it.
+
+    Args:
+        system: the lens.
+        points: N of them.
+        wavelength: (N,), nm.
+
+    Returns:
+        (N,).
+    """
+    distinct, which = wavelength.unique(return_inverse=True)
+    rows = []
+    for w in distinct.tolist():
+        (a, b), _ = matrix_to_stop(system, w)
+        rows.append(torch.stack((a, b * system.signed_indices(w)[0])))
+    a, b = torch.stack(rows)[which].unbind(-1)
+    near, r = points.vergence, system.surfaces[system.stop - 1].edge_radius
+    return torch.pi * r * r / ((a + near * b).square() + (near * r).square())
+
+
+def path_before(points: ObjectPoints, q: Tensor) -> Tensor:
+    """Return a ray's excess length over the line to the first vertex, to the plane that faces it.
+
+    √(D² + q²) - D = q²·w/(1 + √(1 + w²q²)), mm, with D = 1/w the distance to the vertex.
+
+    Args:
+        points: N of them.
+        q: (N, S, S, 2), mm.
+
+    Returns:
+        (N, S, S), zero for points at infinity: to them the plane is a wavefront.
+    """
+    cosine = torch.rsqrt(1.0 + points.slopes.square().sum(-1))
+    w = (cosine * points.vergence)[:, None, None]
+    square = q.square().sum(-1)
+    return w * square / (1.0 + torch.sqrt(1.0 + w * w * square))
+
 
 # Rays across the paraxial entrance pupil in the first search, and bounds of their number along each
 # side of the first surface.

@@ -1,4 +1,4 @@
-"""Point spread functions by Huygens's principle: wavelets from the exit pupil, added up.
+"""Point spread functions and MTF by Huygens's principle: a sum of wavelets from the exit pupil.
 
 Every ray of the pupil stands for a cell of the reference sphere, and sends a spherical wavelet to
 every point of the image, over the exact distance.  Nothing is expanded in small angles, so that the
@@ -19,9 +19,10 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.fields_and_wavelengths import that_count
-from dolens.diffraction.field import direct_field
+from dolens.analysis.modulation_transfer import field_directions
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
-from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
+from dolens.diffraction.field_wavefronts import field_wavefronts, object_points, part_of
+from dolens.diffraction.modulation_transfer import DiffractionModulation
 from dolens.diffraction.point_spread import (
     FieldPointSpread,
     PointSpread,
@@ -29,8 +30,7 @@ from dolens.diffraction.point_spread import (
     of_all_fields,
     window_half_width,
 )
-from dolens.diffraction.prepared_pupils import part_of
-from dolens.diffraction.propagation import turns_across
+from dolens.diffraction.propagation import direct_field, turns_across
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
@@ -40,7 +40,7 @@ _HALF_TURNS = 2.0
 # Fewest rays along each side, unless a number is given.
 _FEWEST = 128
 # Steps of the search for the peak to an Airy radius, and how often it looks three times closer.
-_STEPS, _CLOSER = 2.5, 4
+_PEAK_STEPS, _PEAK_ROUNDS = 2.5, 4
 # Pairs of ray and image point that one field may take: some minutes of one core.
 _MOST_PAIRS = 4e9
 _REASON = "sum of Huygens's wavelets"
@@ -191,13 +191,13 @@ class _Wavelets:
         then closer and closer about the highest point.
         """
         airy = FieldPupil(self.front, self.weights, None, "").airy_radius
-        count = math.ceil(2.0 * self.half * _STEPS / airy)
+        count = math.ceil(2.0 * self.half * _PEAK_STEPS / airy)
         if count > len(grid):
             grid = (torch.arange(count).to(grid) + 0.5) * (2.0 * self.half / count) - self.half
             irradiance = self.added(round(COARSER * rays), grid, grid)[0]
         row, column = divmod(int(irradiance.argmax()), len(grid))
         x, y, reach = grid[column], grid[row], 2.0 * self.half / len(grid)
-        for _ in range(_CLOSER):
+        for _ in range(_PEAK_ROUNDS):
             near = torch.linspace(-reach, reach, 7).to(grid)
             found = self.added(rays, x + near, y + near)[0]
             row, column = divmod(int(found.argmax()), 7)
@@ -224,3 +224,96 @@ class _Wavelets:
         wave = MM_PER_NM * front.wavelength / front.index
         perfect = (front.weight.sum((-2, -1)) / wave).square()
         return mixed, self.weights @ perfect / total
+
+
+# Airy radii that the window is wider, on every side, than that of a point spread function; and
+# points of the image to an Airy radius: three leave the copies of a spectrum that ends at 1.22 over
+# the radius well apart.
+_AIRY_RADII, _STEPS = 4.0, 3.0
+
+
+@torch.no_grad()
+def huygens_modulation(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    frequencies: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> DiffractionModulation:
+    """Compute the polychromatic MTF from sums of Huygens's wavelets.
+
+    It needs no Fourier transform of the pupil, and so holds where that does not (see
+    `dolens.diffraction.huygens`).  The modulation is that of all light: what falls outside of the
+    window, a hundredth or two, is missing at frequencies below one over the window's width, and
+    `sampling_error` counts it.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        frequencies: (Q,), cycles/mm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
+
+    Returns:
+        The curves; the limits, which need a second pupil, are NaN.
+
+    Raises:
+        InputError: as `huygens_point_spread`.
+    """
+    frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu().reshape(-1)
+    points = torch.as_tensor(fields, dtype=torch.float64).cpu()
+    arguments = wavelengths, object_distance, wavelength_weights
+    along = field_directions(points, object_distance)
+    unknown = torch.full_like(frequency, math.nan)
+    curves: list[Tensor] = []
+    errors: list[float] = []
+    diffraction: list[bool] = []
+    reasons: list[str] = []
+    for field, way in zip(points, along, strict=True):
+        half, airy = huygens_window(lens, field, *arguments)
+        half += _AIRY_RADII * airy
+        cells = math.ceil(2.0 * half * _STEPS / airy)
+        found = huygens_point_spread(lens, field[None], *arguments, cells, half)
+        reasons += found.reasons
+        diffraction += found.diffraction
+        if not found.diffraction[0]:
+            curves.append(torch.stack((unknown, unknown)))
+            errors.append(math.nan)
+            continue
+        ways = torch.stack((way, torch.stack((way[1], -way[0]))))
+        curves.append(_transform(found.irradiance[0], float(found.half_width_um), frequency, ways))
+        errors.append(float(found.sampling_error) + abs(1.0 - float(found.held)))
+    tangential, sagittal = torch.stack(curves, 1)
+    limit = unknown.expand(len(points), -1)
+    return DiffractionModulation(
+        points,
+        found.field_unit,
+        found.wavelengths,
+        frequency,
+        tangential,
+        sagittal,
+        limit,
+        limit,
+        tuple(diffraction),
+        tuple(reasons),
+        torch.tensor(errors, dtype=torch.float64),
+    )
+
+
+def _transform(irradiance: Tensor, half_um: float, frequency: Tensor, ways: Tensor) -> Tensor:
+    """Return |∬E·exp(-2πi·ν·(p·way))|, (2, Q), of irradiance (M, M) in shares per µm²."""
+    cells = len(irradiance)
+    step = 2.0 * half_um / cells
+    place = 1e-3 * ((torch.arange(cells).to(irradiance) + 0.5) * step - half_um)
+    found = []
+    for x, y in ways.tolist():
+        # exp(-2πi·ν·(x·X + y·Y)) is a product of one of columns and one of rows.
+        across, down = (
+            torch.polar(torch.ones_like(phase), phase)
+            for phase in (-2.0 * math.pi * frequency[:, None] * w * place for w in (x, y))
+        )
+        sums = ((down @ irradiance.to(down)) * across).sum(-1)
+        found.append(step * step * sums.abs())
+    return torch.stack(found)

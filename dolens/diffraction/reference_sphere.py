@@ -8,7 +8,7 @@ behind the sensor, about a virtual pupil.
 import torch
 from torch import Tensor
 
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
 from dolens.optics.image_surface import TangentPlanes

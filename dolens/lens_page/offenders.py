@@ -11,7 +11,7 @@ A file of tolerances is YAML::
     tolerance_factor: 1           # optional; multiplies all of them
 
 An experiment's file does as well: its `lens.elements` and `tolerances` are read.  Without a file,
-they are the usual ones of `dolens.tolerancing.usual`.
+they are the usual ones of `dolens.tolerancing.tolerances`.
 """
 
 import copy
@@ -38,8 +38,8 @@ from dolens.tolerancing import (
     Tolerances,
     contributions,
     fields_all_around,
-    linear_spots,
     sensitivities,
+    sensitivity,
     spot_weights,
     tolerances_from,
     usual_tolerances,
@@ -152,7 +152,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         where.object_distance,
         symmetry=False,
     )
-    model = linear_spots(lens, spots, tolerances.names)
+    model = sensitivity(lens, spots, tolerances.names)
     of_fields = where.weights.new_tensor(list(fields.values()))
     weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
     return Offenders(

@@ -9,7 +9,7 @@ import torch
 
 from dolens.analysis.conditions import Conditions, conditions, field_points
 from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
-from dolens.analysis.first_order_numbers import first_order_numbers
+from dolens.analysis.paraxial_data import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.lens_page.tables import (

@@ -19,14 +19,22 @@ from dolens.analysis.footprint import footprint
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_fans import ray_fans
-from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
+from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength
+from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.illumination import relative_illumination
-from dolens.diffraction.point_spread import PointSpread, diffraction_encircled_energy, point_spread
-from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
-from dolens.diffraction.strehl import marechal
-from dolens.diffraction.transfer import diffraction_modulation
-from dolens.diffraction.wavefront_error import WavefrontErrors, wavefront_errors
-from dolens.diffraction.wavefront_map import WavefrontMaps, wavefront_maps
+from dolens.diffraction.modulation_transfer import diffraction_modulation
+from dolens.diffraction.point_spread import (
+    PointSpread,
+    diffraction_encircled_energy,
+    marechal,
+    point_spread,
+)
+from dolens.diffraction.wavefront_map import (
+    WavefrontErrors,
+    WavefrontMaps,
+    wavefront_errors,
+    wavefront_maps,
+)
 from dolens.errors import InputError
 from dolens.html import Markup
 from dolens.lens_page.markup import viewer_html
@@ -36,18 +44,17 @@ from dolens.lens_page.solid import solid
 from dolens.lens_page.tables import Table, number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
-from dolens.plotting.encircled_energy import encircled_energy_figure
-from dolens.plotting.field_curves import field_curves_figure
+from dolens.plotting.field_curves import (
+    field_curves_figure,
+    illumination_figure,
+    lateral_colour_figure,
+    rms_curves_figure,
+)
 from dolens.plotting.footprint import footprint_figure
-from dolens.plotting.illumination import illumination_figure
-from dolens.plotting.lateral_colour import lateral_colour_figure
-from dolens.plotting.lens_section import lens_section_figure
-from dolens.plotting.modulation_comparison import modulation_comparison_figure
-from dolens.plotting.point_spread import point_spread_figure
-from dolens.plotting.ray_fans import ray_fans_figure
-from dolens.plotting.rms_curves import rms_curves_figure
-from dolens.plotting.spots import spots_figure
-from dolens.plotting.states import states_layout_figure
+from dolens.plotting.lens_section import lens_section_figure, states_layout_figure
+from dolens.plotting.modulation import modulation_comparison_figure
+from dolens.plotting.point_spread import encircled_energy_figure, point_spread_figure
+from dolens.plotting.spots_and_ray_fans import ray_fans_figure, spots_figure
 from dolens.plotting.wavefront_maps import wavefront_maps_figure
 
 

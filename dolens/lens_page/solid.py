@@ -22,7 +22,7 @@ from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse
 from dolens.optics.surfaces.obscurations import Ring, Spider, Together
 from dolens.optics.surfaces.outlines import Point, Polygons
 from dolens.optics.system import OpticalSystem
-from dolens.plotting.surface_cut import sag_of
+from dolens.plotting.section import sag_of
 
 AZIMUTHS = 64
 _ACROSS = 10

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.analysis.conditions import Conditions
-from dolens.analysis.first_order_numbers import first_order_numbers
-from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
+from dolens.analysis.paraxial_data import ABERRATIONS, first_order_numbers, seidel_sums
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.optics.elements import POSE, TILTS
 from dolens.optics.fields import field_label, weights_text

@@ -1,6 +1,6 @@
 """A form is reported: its powers, colour errors, checks, sensitivity to tolerances, and files.
 
-The tolerances are those of `dolens.tolerancing.usual`, whose lengths are scaled to the lens.  The
+The tolerances are those of `dolens.tolerancing.tolerances`, whose lengths are scaled to the lens.  The
 spots of lenses as they would be made come from the linear ray model: no lens is traced again.
 """
 
@@ -24,8 +24,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_numbers import ParaxialNumbers
-from dolens.plotting.forms import form_section
-from dolens.plotting.small_section import SmallSection
+from dolens.plotting.small_sections import SmallSection, form_section
 from dolens.plotting.tolerances import parameter_label
 from dolens.prescriptions.build import prescription_of
 from dolens.prescriptions.conversion import converted
@@ -34,8 +33,8 @@ from dolens.tolerancing import (
     Yield,
     contributions,
     fields_all_around,
-    linear_spots,
     quantiles,
+    sensitivity,
     spot_weights,
     tolerances_from,
     usual_tolerances,
@@ -199,7 +198,7 @@ def lens_sensitivity(lens: Lens) -> LensSensitivity:
     )
     of_fields = where.weights.new_tensor(list(fields.values()))
     weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
-    model = linear_spots(made, spots, tolerances.names)
+    model = sensitivity(made, spots, tolerances.names)
     adding = contributions(model, tolerances, weights)
     errors = tolerances.draw(_LENSES, torch.Generator().manual_seed(_SEED))
     curves = model.focus_curves(errors)

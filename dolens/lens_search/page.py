@@ -20,9 +20,8 @@ from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.verification import Check
 from dolens.optics.fields import field_label
 from dolens.plotting.export import laid_out
-from dolens.plotting.forms import common_size, form_figure
-from dolens.plotting.number_text import number_text
-from dolens.plotting.scale_bar import round_length
+from dolens.plotting.small_sections import common_size, form_figure
+from dolens.plotting.style import number_text, round_length
 
 GENERATOR = "dolens search"
 # The share of a section's width that the bar of its scale may take.

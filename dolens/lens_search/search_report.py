@@ -15,7 +15,7 @@ from dolens.files import written_whole
 from dolens.lens_page.tables import number
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.page import Pictures, forms_page
-from dolens.plotting.forms import FormPicture, forms_figure
+from dolens.plotting.small_sections import FormPicture, forms_figure
 
 logger = logging.getLogger(__name__)
 

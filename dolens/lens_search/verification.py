@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from dolens.analysis.conditions import Conditions, conditions
-from dolens.analysis.parabasal import parabasal_rays
-from dolens.analysis.rms_curves import rms_against_field
+from dolens.analysis.field_curves import parabasal_rays
+from dolens.analysis.spot_diagram import rms_against_field
 from dolens.errors import InputError
 from dolens.lens_search.real_beams import (
     FIELDS,

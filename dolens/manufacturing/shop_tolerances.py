@@ -9,7 +9,7 @@ from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import read_yaml_file
-from dolens.tolerancing.perturbations import Tolerances, tolerances_from
+from dolens.tolerancing.tolerances import Tolerances, tolerances_from
 
 AGREE = "to be agreed"
 # What a drawing says that no ray trace needs, in ISO 10110's codes.

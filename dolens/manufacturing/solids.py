@@ -12,8 +12,7 @@ from dolens.errors import InputError
 from dolens.manufacturing import modeller
 from dolens.manufacturing.glass_elements import SAME_LENGTH, Face, GlassElement
 from dolens.manufacturing.modeller import Shape, box, common, meridian, occ, parts, tensor_spline
-from dolens.plotting.style import SMALL, colours
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import SMALL, colours, draw_title
 
 # What cuts a solid reaches this much farther than the solid does.
 _BEYOND = 1.02

@@ -9,9 +9,13 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
-from dolens.optimize.bounded_step import bounded_step, projected_step
-from dolens.optimize.linear_model import LinearModel
-from dolens.optimize.residuals import Residuals, TensorResiduals
+from dolens.optimize.linear_least_squares import (
+    LinearModel,
+    Residuals,
+    TensorResiduals,
+    bounded_step,
+    projected_step,
+)
 
 DAMPINGS = ("multiplicative", "identity")
 BOUNDS = ("active", "projected")
@@ -261,7 +265,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
         if not isinstance(found, Residuals):
             raise InputError(
                 f"least squares: the closure returns {type(found).__name__}; allowed: a tensor of "
-                "residuals, or an object as dolens.optimize.residuals.Residuals"
+                "residuals, or an object as dolens.optimize.linear_least_squares.Residuals"
             )
         return found
 

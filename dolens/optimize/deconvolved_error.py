@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.optimize.loss_residuals import RayGroups
+from dolens.optimize.ray_intercept_quality import RayGroups
 
 # Rows: luminance, red against blue, green against both (see `opponent_wiener`).
 _OPPONENT = ((1.0, 1.0, 1.0), (1.0, 0.0, -1.0), (1.0, -2.0, 1.0))

@@ -20,7 +20,7 @@ from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Status, TracedRays
-from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.linear_least_squares import LinearModel
 
 REFERENCES = ("centroid", "chief")
 SPECTRA = ("monochromatic", "polychromatic")

@@ -13,9 +13,13 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.straight import require_plane_sensor
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
-from dolens.optimize.linear_model import LinearModel
-from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operand_values import OperandValue, OperandValues, evaluate_operands
+from dolens.optimize.linear_least_squares import LinearModel
+from dolens.optimize.operand_values import (
+    OperandModel,
+    OperandValue,
+    OperandValues,
+    evaluate_operands,
+)
 from dolens.optimize.operands import Operand, UnreachableField
 
 

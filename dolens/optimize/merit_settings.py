@@ -20,7 +20,6 @@ from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
-from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import (
     MOST_WEIGHT,
@@ -29,8 +28,14 @@ from dolens.optimize.operands import (
     check_operand_fields,
     operand,
 )
-from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
-from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.ray_intercept_quality import (
+    EncircledEnergy,
+    LossResiduals,
+    Modulation,
+    RayInterceptLoss,
+    RayInterceptResiduals,
+    SpotSize,
+)
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
@@ -64,8 +69,8 @@ class MeritSettings:
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
             ray intercepts: `modulation`, `encircled_energy`, `spot_size`, or an object that is
             called as `RayInterceptLoss` is; None: operands alone.
-        quality_options: of a loss by name, see `dolens.optimize.ray_intercept_losses`; and the
-            `curvature` of any loss, see `dolens.optimize.loss_residuals`.
+        quality_options: of a loss by name, see `dolens.optimize.ray_intercept_quality`; and the
+            `curvature` of any loss, see `dolens.optimize.ray_intercept_quality`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
         reference_spectrum: `monochromatic`: each wavelength has a reference of its own; or
             `polychromatic`: one for all wavelengths of a field.

@@ -1,7 +1,9 @@
-"""Design variables are parameters of a lens, scaled, bounded and named for an optimizer."""
+"""Design variables are parameters of a lens, scaled, bounded and named for an optimizer; their
+number decides which optimizer a design takes.
+"""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -9,12 +11,12 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import to_file_units, unit_factors, unit_of
+from dolens.optics.parameter_units import to_file_units, to_lens_units, unit_factors, unit_of
 from dolens.optics.row_jacobian import jacobian_of
-from dolens.optimize.dependents import Dependent, dependent, of_each_state
+from dolens.optimize.pickups_and_solves import Dependent, dependent, of_each_state
 from dolens.typed_values import check_type
 
-_KEYS = ("scale", "initial", "lower", "upper")
+_VARIABLE_KEYS = ("scale", "initial", "lower", "upper")
 
 
 class DesignVariables(nn.Module):
@@ -80,7 +82,7 @@ class DesignVariables(nn.Module):
             settings = dict(settings or {})
             if pattern in following:
                 continue
-            check_keys(settings, _KEYS, f"variable '{pattern}'")
+            check_keys(settings, _VARIABLE_KEYS, f"variable '{pattern}'")
             found = {pattern: further[pattern]} if pattern in further else None
             for name, parameter in (found or lens.variables([pattern])).items():
                 if name in following:
@@ -249,3 +251,92 @@ def _setting(settings: Mapping[str, Any], key: str, default: float, pattern: str
     if math.isnan(number):
         raise InputError(f"variable '{pattern}': {key} must be a number, not {value!r}")
     return number
+
+
+_START_KEYS = ("multiply", "add", "relative", "absolute")
+_WITHOUT_UNIT = ("multiply", "relative")
+
+
+def start_values(
+    lens: Lens, settings: Mapping[str, float | Mapping[str, Any]], generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Return parameters of a lens to begin with; the lens is not changed.
+
+    Args:
+        lens: whose parameters are named.
+        settings: pattern → a number; or `multiply` and `add`, applied in this order; or `relative`
+            and `absolute`, standard deviations of normal errors, as a share of the parameter and in
+            its unit.  Numbers are in the units of files, degrees for tilts.
+            Later patterns go on from what earlier ones made.
+        generator: of the errors.
+
+    Returns:
+        name → value, of the parameters that a pattern names.
+
+    Raises:
+        InputError: an unknown pattern or key, or a value that is no finite number.
+    """
+    found: dict[str, Tensor] = {}
+    for pattern, change in settings.items():
+        written = _numbers(pattern, change)
+        for name, parameter in lens.variables([pattern]).items():
+            numbers = {
+                key: value if key in _WITHOUT_UNIT else to_lens_units(name, value)
+                for key, value in written.items()
+            }
+            value = found.get(name, parameter.detach().clone())
+            if "value" in numbers:
+                found[name] = torch.full_like(value, numbers["value"])
+                continue
+            errors = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value)
+            value = value * numbers.get("multiply", 1.0) + numbers.get("add", 0.0)
+            spread = numbers.get("relative", 0.0) * value + numbers.get("absolute", 0.0)
+            found[name] = value + spread * errors
+    return found
+
+
+def _numbers(pattern: str, change: object) -> dict[str, float]:
+    given: dict[str, Any] = dict(change) if isinstance(change, Mapping) else {"value": change}
+    if isinstance(change, Mapping):
+        check_keys(change, _START_KEYS, f"start '{pattern}'")
+    for key, value in given.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise InputError(f"start '{pattern}': {key} must be a finite number, not {value!r}")
+    return {key: float(value) for key, value in given.items()}
+
+
+ParameterGroups = Iterable[Tensor] | Iterable[dict[str, Any]]
+
+
+def by_number_of_variables(
+    params: ParameterGroups,
+    max_variables: int,
+    few: Callable[[ParameterGroups], torch.optim.Optimizer],
+    many: Callable[[ParameterGroups], torch.optim.Optimizer],
+) -> torch.optim.Optimizer:
+    """Return an optimizer whose step costs what the problem's size allows (supplement, Section II
+    A).
+
+    A step of damped least squares factors a matrix with a column for each variable; one of Adam
+    costs a gradient, whatever their number.
+
+    Args:
+        params: tensors, or groups of them, as every optimizer takes.
+        max_variables: variables up to which `few` is taken.
+        few: for example damped least squares.
+        many: for example Adam.
+
+    Raises:
+        InputError: `max_variables` is negative.
+    """
+    if max_variables < 0:
+        raise InputError(f"optimizer.max_variables: {max_variables}; allowed: 0 or more variables")
+    given: list[Any] = list(params)
+    tensors = [
+        tensor
+        for entry in given
+        for tensor in (entry["params"] if isinstance(entry, dict) else [entry])
+    ]
+    count = sum(tensor.numel() for tensor in tensors)
+    return (few if count <= max_variables else many)(given)

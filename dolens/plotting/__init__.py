@@ -1,18 +1,25 @@
 """Functions turn data into a `matplotlib.figure.Figure`, without global state."""
 
-from dolens.plotting.before_after import before_after_figure
-from dolens.plotting.comparison import comparison_figure
 from dolens.plotting.export import figure_to_image, save_figure, save_figures
-from dolens.plotting.history import history_figure
+from dolens.plotting.field_curves import rms_curves_figure
 from dolens.plotting.layout import layout_figure
+from dolens.plotting.lens_section import before_after_figure
 from dolens.plotting.modulation import modulation_figure
 from dolens.plotting.pareto import Point, pareto_figure, pareto_front
-from dolens.plotting.psf import psf_figure
-from dolens.plotting.ray_fans import ray_fans_figure
-from dolens.plotting.rms_curves import rms_curves_figure
+from dolens.plotting.pictures import comparison_figure
+from dolens.plotting.point_spread import psf_figure
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
-from dolens.plotting.search import SearchTrial, search_history_figure, trade_off_figure
-from dolens.plotting.spots import spots_comparison_figure, spots_figure
+from dolens.plotting.search import (
+    SearchTrial,
+    history_figure,
+    search_history_figure,
+    trade_off_figure,
+)
+from dolens.plotting.spots_and_ray_fans import (
+    ray_fans_figure,
+    spots_comparison_figure,
+    spots_figure,
+)
 
 __all__ = [
     "Point",

@@ -1,7 +1,9 @@
-"""Figures are written to files or converted to image tensors."""
+"""Figures are written to files, shown in notebooks, or converted to image tensors."""
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,3 +112,20 @@ def figure_to_image(figure: Figure, dpi: float = 80) -> Tensor:
     finally:
         figure.set_dpi(before)
     return torch.from_numpy(rgb.transpose(2, 0, 1).copy())
+
+
+def showing(figure: Figure) -> Figure:
+    """Return the same figure, with the picture that IPython asks an object for.
+
+    IPython's own formatter for figures exists only where pyplot was set up; where it does, it comes
+    first and this is not asked, so that a figure is shown once.
+    """
+    figure._repr_png_ = partial(png_of, figure)  # type: ignore[attr-defined]
+    return figure
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return buffer.getvalue()

@@ -13,10 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from dolens.analysis.footprint import Footprint
 from dolens.optics.fields import field_label
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.plotting.legends import legend_below
-from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, SMALL, colours
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import PAGE, SMALL, colours, draw_title, legend_below, number_text
 
 _COLUMNS = 4
 # Points along each side of the grid on which outlines are found, and room about them.

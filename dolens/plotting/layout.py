@@ -1,24 +1,46 @@
-"""A layout shows a lens in section with its rays."""
+"""A layout shows a lens in section with its rays: what is drawn, and the figure."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.captions import plain_text
-from dolens.plotting.drawing import draw_layout, layout_drawing
-from dolens.plotting.number_text import number_text, with_minus
-from dolens.plotting.style import PAGE, SMALL, open_axes
-from dolens.plotting.surface_cut import SAMPLES, sag_of
-from dolens.plotting.titles import draw_axes_title
+from dolens.plotting.section import (
+    SAMPLES,
+    Profile,
+    axis_angle,
+    broken_axis,
+    element_edges,
+    obscuration_profiles,
+    sag_of,
+    sensor_curve,
+    sensor_line,
+    surface_profile,
+    trace_fan,
+)
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    draw_axes_title,
+    number_text,
+    open_axes,
+    ordered_colours,
+    spectral_colour,
+    with_minus,
+)
 
 # A sag below this share of the height of the drawing cannot be seen.
 _VISIBLE = 0.02
@@ -172,3 +194,240 @@ def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.legend(frameon=False, fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     open_axes(axes)
+
+
+# Rays start this far in front of the lens, in units of the distance from lens to sensor.
+_LEAD = 0.1
+_GLASS = "#D9E8F2"
+_EDGE = "#2B3A42"
+
+
+class Fan(NamedTuple):
+    """A `Fan` holds rays of one field (degrees) and wavelength (nm): (rays, points, 3) in mm."""
+
+    field: float
+    wavelength: float
+    paths: np.ndarray
+
+
+class LayoutDrawing(NamedTuple):
+    """A `LayoutDrawing` holds a section of a lens with its rays, mm.
+
+    Attributes:
+        system: the lens.
+        profiles: of every surface, in the plane x = 0.
+        fans: of every field and wavelength.
+        height: the largest of the surfaces and of the sensor, from the axis.
+        sensor: half of the sensor.
+        z_limits: of axes that hold everything.
+        half_height: of axes that hold everything.
+    """
+
+    system: OpticalSystem
+    profiles: Sequence[Profile]
+    fans: Sequence[Fan]
+    height: float
+    sensor: float
+    z_limits: tuple[float, float]
+    half_height: float
+
+    @property
+    def needs_legend(self) -> bool:
+        """Return whether colours must be told apart, or a field has no rays."""
+        return len(self.fans) > 1 or not len(self.fans[0].paths)
+
+
+def layout_drawing(
+    lens: Lens,
+    wavelength: float | Sequence[float],
+    fields_deg: Sequence[float],
+    rays: int,
+    object_distance: float | None = None,
+    values: Mapping[str, Tensor] | None = None,
+    sensor: float | None = None,
+) -> LayoutDrawing:
+    """Section a lens and trace its rays; arguments and errors are those of `layout_figure`."""
+    sensor = sensor or lens.sensor_diameter
+    lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
+    system = lens.system(values)
+    _check(fields_deg, rays, lines, 180.0 if system.from_the_side else 90.0)
+    profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
+    # The sensor's middle, and the sections of all surfaces.
+    back = float(np.concatenate([sensor_line(system, 0.0)[:, 0], *(z for z, _ in profiles)]).max())
+    front = min((float(z.min()) for z, _ in profiles if len(z)), default=0.0)
+    start = front - _LEAD * (back - min(front, 0.0))
+    fans = [
+        Fan(field, line, trace_fan(system, line, field, rays, object_distance, start))
+        for field in fields_deg
+        for line in lines
+    ]
+    height = max((float(np.abs(y).max()) for _, y in profiles if len(y)), default=1.0)
+    height = max(height, 0.5 * (sensor or 0.0))
+    reach = max(
+        [height, *(float(np.abs(fan.paths[..., 1]).max()) for fan in fans if len(fan.paths))]
+    )
+    lit = [fan.paths for fan in fans if len(fan.paths)]
+    if sensor:
+        half = 0.5 * sensor
+    elif system.breaks or system.mirrors:
+        # What the rays need, seen along the sensor.
+        middle, end = sensor_line(system, 0.0)[0], sensor_line(system, 1.0)[1]
+        landed = [(paths[:, -1, [2, 1]] - middle) @ (end - middle) for paths in lit]
+        half = 1.1 * max((float(np.abs(y).max()) for y in landed), default=0.1 * height)
+        half = max(half, 0.05 * height)
+    else:
+        half = reach
+    ends = sensor_curve(system, half)
+    front = min([start, *(float(paths[..., 2].min()) for paths in lit), ends[:, 0].min()])
+    back = max([back, *(float(paths[..., 2].max()) for paths in lit), ends[:, 0].max()])
+    margin = 0.04 * (back - front)
+    return LayoutDrawing(
+        system,
+        profiles,
+        fans,
+        height,
+        half,
+        (front - margin, back + margin),
+        1.06 * max(reach, _stop_bar(system.stop, profiles, height), np.abs(ends[:, 1]).max()),
+    )
+
+
+def draw_layout(
+    axes: Axes,
+    drawing: LayoutDrawing,
+    z_limits: tuple[float, float],
+    half_height: float,
+    legend: bool = True,
+) -> None:
+    """Draw into axes of the given limits (mm), at equal scales."""
+    system, profiles = drawing.system, drawing.profiles
+    if system.breaks:
+        _draw_axis(axes, np.concatenate([[[z_limits[0], 0.0]], broken_axis(system)]))
+    else:
+        _draw_axis(axes, np.array([[z_limits[0], 0.0], [z_limits[1], 0.0]]))
+    _draw_glass(axes, system, profiles)
+    _draw_rays(axes, drawing.fans, legend)
+    _draw_stop(axes, system, profiles, drawing.height)
+    _draw_obscurations(axes, system)
+    ends = sensor_curve(system, drawing.sensor)
+    axes.plot(*ends.T, color="black", linewidth=2.5, gid="sensor", zorder=4)
+    axes.set(aspect="equal", xlim=z_limits, ylim=(-half_height, half_height))
+    axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
+    axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
+    open_axes(axes)
+
+
+def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float], limit: float) -> None:
+    if not lines:
+        raise InputError("layout: at least one wavelength, not none")
+    if rays < 1 or not fields_deg:
+        raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
+    for field in fields_deg:
+        if not abs(field) < limit:
+            raise InputError(f"layout: fields must be within ±{limit:g} degrees, not {field:g}")
+
+
+def _draw_axis(axes: Axes, points: np.ndarray) -> None:
+    axes.plot(
+        *points.T,
+        color="0.55",
+        linewidth=0.7,
+        dashes=(12, 3, 2, 3),
+        gid="axis",
+        zorder=1,
+    )
+
+
+def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) -> None:
+    """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
+    bounding: set[int] = set()
+    for number, other in system.neighbours:
+        if is_glass(system.materials[number]):
+            bounding |= {number, other}
+            faces = profiles[number - 1], profiles[other - 1]
+            if not (len(faces[0][0]) and len(faces[1][0])):
+                continue
+            top, bottom = element_edges(system, (number, other), *faces)
+            front, back = (np.stack(p, -1) for p in faces)
+            outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
+            gid = f"glass {number}"
+            axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
+            for edge in (top, bottom):
+                axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
+    for number, (z, y) in enumerate(profiles, 1):
+        mirror = number in system.mirrors
+        refracts = system.refracts(number)
+        if mirror or number in bounding or (refracts and number != system.stop):
+            width = 2.2 if mirror else 1.0
+            axes.plot(z, y, color=_EDGE, linewidth=width, gid=f"surface {number}", zorder=2)
+
+
+def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
+    lines = sorted({fan.wavelength for fan in fans})
+    by_wavelength = len(lines) > 1
+    keys = lines if by_wavelength else list(dict.fromkeys(fan.field for fan in fans))
+    shades = [spectral_colour(line) for line in lines]
+    shades = shades if by_wavelength else ordered_colours(len(keys))
+    colour_of = dict(zip(keys, shades, strict=True))
+    passing = dict.fromkeys(keys, False)
+    for fan in fans:
+        key = fan.wavelength if by_wavelength else fan.field
+        passing[key] |= len(fan.paths) > 0
+        for path in fan.paths:
+            axes.plot(
+                path[:, 2], path[:, 1], color=colour_of[key], linewidth=0.7, gid="ray", zorder=3
+            )
+    if not legend or (len(keys) == 1 and passing[keys[0]]):
+        return
+    unit = " nm" if by_wavelength else "°"
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=colour_of[key],
+            linewidth=1.2,
+            label=with_minus(f"{key:g}{unit}") + ("" if passing[key] else " (no ray passes)"),
+        )
+        for key in keys
+    ]
+    axes.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        frameon=False,
+        fontsize=SMALL,
+        title="wavelength" if by_wavelength else "field",
+        title_fontsize=SMALL,
+    )
+
+
+def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
+    """Return the distance from the axis at which the stop's bars end, mm."""
+    y = profiles[stop - 1][1]
+    return (float(np.abs(y).max()) if len(y) else 0.0) + 0.2 * height
+
+
+def _draw_stop(
+    axes: Axes, system: OpticalSystem, profiles: Sequence[Profile], height: float
+) -> None:
+    """Draw bars outside the stop's edge, in its plane, with a tick along its axis at the edge."""
+    z, y = profiles[system.stop - 1]
+    if not len(z):
+        return
+    angle = axis_angle(system, system.stop)
+    along = np.array([math.cos(angle), math.sin(angle)])
+    outwards = np.array([-along[1], along[0]])
+    tick = 0.025 * height * along
+    length = _stop_bar(system.stop, profiles, height) - float(np.abs(y).max())
+    for end, side in ((-1, 1.0), (0, -1.0)):
+        rim = np.array([z[end], y[end]])
+        bar = np.stack([rim, rim + side * length * outwards]).T
+        axes.plot(*bar, color="black", linewidth=2.0, solid_capstyle="butt", gid="stop", zorder=4)
+        ends = np.stack([rim - tick, rim + tick]).T
+        axes.plot(*ends, color="black", linewidth=1.2, gid="stop tick", zorder=4)
+
+
+def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
+    for number in system.met:
+        for profile in obscuration_profiles(system, number):
+            axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

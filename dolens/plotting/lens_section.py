@@ -1,17 +1,40 @@
-"""The section of a lens at its own fields, for any object distance."""
+"""Layouts of a lens at its own fields, before and after a change, and in each of its states."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from dolens.analysis.field_curves import FieldCurves
+from dolens.errors import InputError
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
 from dolens.plotting.captions import caption
-from dolens.plotting.layout import layout_figure
+from dolens.plotting.field_curves import scan_label
+from dolens.plotting.layout import (
+    WIDTH,
+    draw_layout,
+    drawn_height,
+    layout_drawing,
+    layout_figure,
+    layout_title,
+    optics_text,
+)
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    draw_axes_title,
+    draw_title,
+    legend_below,
+    ruled_axes,
+    spectral_colour,
+)
 
 
 @torch.no_grad()
@@ -70,3 +93,159 @@ def section_angles(
     away = object_distance + float(entrance_pupil(lens.system().double(), wavelength).z)
     # Chief rays of a near object come down from a point above the axis.
     return [-math.degrees(math.atan(height / away)) + 0.0 for height in heights]
+
+
+@torch.no_grad()
+def before_after_figure(
+    before: Lens,
+    after: Lens,
+    wavelength: float | Sequence[float] = 587.5618,
+    fields_deg: Sequence[float] = (0.0,),
+    rays: int = 7,
+    object_distance: float | None = None,
+    titles: tuple[str, str] | None = None,
+) -> Figure:
+    """Draw two layouts one above the other, at one scale and with their first vertices aligned.
+
+    Args:
+        before: drawn above.
+        after: drawn below.
+        wavelength: nm, as for `layout_figure`.
+        fields_deg: degrees, as for `layout_figure`.
+        rays: a field.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        titles: of the two; None for `initial` and `final` with names, focal lengths and F-numbers.
+
+    Raises:
+        InputError: as `layout_figure` does.
+    """
+    lenses = (before, after)
+    drawings = [
+        layout_drawing(lens, wavelength, fields_deg, rays, object_distance) for lens in lenses
+    ]
+    z_limits = (
+        min(drawing.z_limits[0] for drawing in drawings),
+        max(drawing.z_limits[1] for drawing in drawings),
+    )
+    half_height = max(drawing.half_height for drawing in drawings)
+    legend = any(drawing.needs_legend for drawing in drawings)
+    height = min(drawn_height(z_limits, half_height, legend), 3.6)
+    # The upper drawing has no numbers below.  Were there height to spare, constrained layout would
+    # widen axes of equal scales until their labels leave the figure.
+    figure = Figure(figsize=(WIDTH, 2.0 * height - 0.5), layout="constrained")
+    grid = figure.subplots(2, 1, sharex=True, sharey=True)
+    for number, (axes, lens, drawing) in enumerate(zip(grid, lenses, drawings, strict=True)):
+        draw_layout(axes, drawing, z_limits, half_height, legend=number == 0)
+        if titles is None:
+            line = drawing.fans[0].wavelength
+            stage = ("initial", "final")[number]
+            name = layout_title(lens, drawing.system, line, object_distance, stage)
+            title = f"({'ab'[number]}) {name}"
+        else:
+            title = titles[number]
+        draw_axes_title(axes, title)
+    grid[0].set_xlabel("")
+    return figure
+
+
+# Inches: of a section at the least, and of what stands beside it.
+_LOWEST, _BESIDE, _HEADING = 0.9, 0.95, 0.45
+
+
+@torch.no_grad()
+def states_layout_figure(
+    states: Mapping[str, Lens], rays: int = 5, title: str | None = None
+) -> Figure:
+    """Draw the sections of a lens in its states, one below the other at one scale.
+
+    The sensors stand below each other, so that what moves between two drawings is a group of
+    surfaces.  Each state has the rays of its own fields and object distance.
+
+    Args:
+        states: name → the lens in that state (`Lens.in_state`).
+        rays: of each field.
+        title: above all.
+
+    Raises:
+        InputError: there are no states, or one cannot be drawn; see `layout_figure`.
+    """
+    if not states:
+        raise InputError("states_layout_figure needs one state or more")
+    drawings, ends = {}, {}
+    for name, lens in states.items():
+        points = [(0.0, 0.0)] if lens.fields is None else lens.fields.points
+        heights = list(dict.fromkeys(y for x, y in points if x == 0.0)) or [0.0]
+        distance = lens.object_distance
+        wave = lens.primary_wavelength
+        angles = section_angles(lens, heights, wave, distance)
+        drawings[name] = layout_drawing(lens, wave, angles, rays, distance)
+        ends[name] = float(lens.system().vertices[-1])
+    before = max(ends[name] - d.z_limits[0] for name, d in drawings.items())
+    behind = max(d.z_limits[1] - ends[name] for name, d in drawings.items())
+    half_height = max(drawing.half_height for drawing in drawings.values())
+    drawn = (WIDTH - _BESIDE) * 2.0 * half_height / (before + behind)
+    height = min(max(drawn, _LOWEST), 2.0) + _HEADING
+    figure = Figure(figsize=(WIDTH, height * len(states) + 0.6), layout="constrained")
+    grid = figure.subplots(len(states), 1, squeeze=False)[:, 0]
+    for axes, (name, drawing) in zip(grid, drawings.items(), strict=True):
+        limits = (ends[name] - before, ends[name] + behind)
+        draw_layout(axes, drawing, limits, half_height, legend=False)
+        lens = states[name]
+        optics = optics_text(drawing.system, lens.primary_wavelength, lens.object_distance)
+        if lens.object_distance is not None:
+            optics += f", object at {lens.object_distance:.4g} mm"
+        axes.set_title(f"{name}: {optics}", fontsize=SMALL + 1)
+    for axes in grid[:-1]:
+        axes.set_xlabel("")
+    draw_title(figure, title)
+    return figure
+
+
+def states_field_curves_figure(
+    states: Mapping[str, FieldCurves], title: str | None = None
+) -> Figure:
+    """Plot field curvature above and distortion below, a column for every state, at one scale.
+
+    Tangential foci are solid and sagittal ones dashed, at the reference wavelength.
+
+    Args:
+        states: name → curves of the lens in that state.
+        title: above all.
+
+    Raises:
+        InputError: there are no states.
+    """
+    if not states:
+        raise InputError("states_field_curves_figure needs one state or more")
+    figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
+    grid = figure.subplots(2, len(states), squeeze=False, sharex="row")
+    for column, (name, curves) in enumerate(states.items()):
+        number = int((curves.wavelengths - curves.reference_wavelength).abs().argmin())
+        field = curves.scan.coordinate.numpy()
+        style = {"color": spectral_colour(curves.reference_wavelength), "linewidth": 1.4}
+        above, below = grid[:, column]
+        above.plot(curves.tangential[:, number].numpy(), field, gid="tangential", **style)
+        above.plot(
+            curves.sagittal[:, number].numpy(), field, gid="sagittal", linestyle="--", **style
+        )
+        below.plot(curves.distortion.numpy(), field, gid="distortion", **style)
+        above.set_title(name, fontsize=SMALL + 1)
+        for axes in (above, below):
+            axes.set_ylim(float(np.min(field)), float(np.max(field)))
+            axes.axvline(0.0, color="0.6", linewidth=0.8, zorder=1)
+            axes.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
+            ruled_axes(axes)
+        above.set_xlabel("focus (mm)", fontsize=SMALL)
+        below.set_xlabel("distortion (%)", fontsize=SMALL)
+    labels = [scan_label(curves.scan) for curves in states.values()]
+    for column, label in enumerate(labels):
+        if column == 0 or label != labels[column - 1]:
+            for axes in grid[:, column]:
+                axes.set_ylabel(label, fontsize=SMALL + 1)
+    handles: Sequence[Line2D] = [
+        Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
+        Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
+    ]
+    legend_below(figure, handles, 2)
+    draw_title(figure, title)
+    return figure

@@ -1,5 +1,5 @@
-"""A tolerance analysis is plotted: Jacobians as matrices, yields as curves, worst offenders as
-bars.
+"""Tolerances are plotted: Jacobians as matrices, worst offenders as bars, yields as curves, and
+how good lenses of a series are.
 """
 
 import re
@@ -15,10 +15,16 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.plotting.captions import plain_text
-from dolens.plotting.legends import legend_below
-from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import (
+    PAGE,
+    PALETTE,
+    SMALL,
+    TITLE,
+    draw_title,
+    legend_below,
+    number_text,
+    open_axes,
+)
 
 _CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.14
 # Inches for the labels of rows, and for those of columns with titles and colour bars.
@@ -252,3 +258,74 @@ def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:
                 fontweight="bold",
             )
         row += count
+
+
+def made_front_figure(
+    arms: Mapping[str, Mapping[float, tuple[float, float, float]]],
+    drawn: Mapping[str, float],
+    title: str,
+) -> Figure:
+    """Draw the PSNR of the worst tenth of the lenses over the factor of their tolerances.
+
+    Args:
+        arms: name of a camera → factor → worst decile and its interval, dB.
+        drawn: name → PSNR of its lens as drawn, dB.
+        title: of the figure.
+    """
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    factors: Sequence[float] = []
+    for number, (name, curve) in enumerate(arms.items()):
+        factors = sorted(curve)
+        middle, low, high = zip(*(curve[factor] for factor in factors), strict=True)
+        colour = f"C{number}"
+        axes.plot(factors, middle, "o-", color=colour, label=name)
+        axes.fill_between(factors, low, high, color=colour, alpha=0.2, linewidth=0.0)
+        axes.axhline(drawn[name], color=colour, linestyle=":", label=f"{name}, lens as drawn")
+    axes.set_xscale("log")
+    axes.set_xticks(factors, [f"{factor:g}" for factor in factors])
+    axes.minorticks_off()
+    axes.set_xlabel("factor of all tolerances")
+    axes.set_ylabel("PSNR of the worst tenth of the lenses, dB")
+    above = axes.secondary_xaxis("top", functions=(_reciprocal, _reciprocal))
+    above.set_xticks([1.0 / f for f in factors], [f"{1.0 / f:.2g}" for f in factors])
+    above.minorticks_off()
+    above.set_xlabel("cost of the tolerances, Σ a/t, relative to factor 1")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.suptitle(title, fontsize="medium")
+    return figure
+
+
+def _reciprocal(value: Any) -> Any:
+    # Matplotlib asks at zero too, of an axis that has none.
+    return 1.0 / np.maximum(value, 1e-9)
+
+
+def made_lenses_figure(
+    scores: Mapping[str, Tensor], drawn: Mapping[str, float], passing: float, title: str
+) -> Figure:
+    """Draw the share of lenses that reach a PSNR.
+
+    Args:
+        scores: name of a series → PSNR of each lens, (N,), dB.
+        drawn: name → PSNR of its lens as drawn, dB.
+        passing: the least PSNR of a lens that passes, dB.
+        title: of the figure.
+    """
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for number, (name, found) in enumerate(scores.items()):
+        ascending = found.sort().values
+        share = 1.0 - torch.arange(len(ascending)) / len(ascending)
+        colour = f"C{number}"
+        axes.step(ascending, 100.0 * share, where="pre", color=colour, label=name)
+        axes.axvline(drawn[name], color=colour, linestyle=":", label=f"{name}, lens as drawn")
+    axes.axvline(passing, color="0.5", linewidth=0.8, label="passes")
+    axes.set_xlabel("PSNR of the worst view, dB")
+    axes.set_ylabel("lenses that reach it, %")
+    axes.set_ylim(0.0, 103.0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    axes.set_title(title, fontsize="medium")
+    return figure

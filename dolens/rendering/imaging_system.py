@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from dolens.optics.system import OpticalSystem
-from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil
+from dolens.rendering.exit_pupil import ExitPupil, sampled_exit_pupil
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 

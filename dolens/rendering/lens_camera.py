@@ -11,8 +11,8 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Status
 from dolens.rendering.chief_ray_map import fit_chief_ray_map
+from dolens.rendering.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 

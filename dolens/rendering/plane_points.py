@@ -12,11 +12,10 @@ from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
+from dolens.rendering.aperture_edges import AZIMUTHS, EdgeRays, edge_rays, pupil_boundary
+from dolens.rendering.differentiable_geometry import depends_on_parameters
+from dolens.rendering.exit_pupil import rays_to_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
-from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
-from dolens.rendering.pupil.pupil_boundary import AZIMUTHS, pupil_boundary
-from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 
 # Radii of sensor points closer than this share of the largest are one radius.
 _SAME_RADIUS = 1e-7

@@ -8,14 +8,21 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from dolens.diffraction.diffraction_limit import with_diffraction_limit
+from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError
 from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.differentiable_geometry import differentiable_exit_pupil
+from dolens.rendering.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.patches import PatchLayout, node_positions, patches
-from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
+from dolens.rendering.patch_convolution import (
+    Coordinates,
+    PatchLayout,
+    convolve_patches,
+    node_positions,
+    patches,
+)
 from dolens.rendering.protocol import Renderer, SensorWindow, WindowShare
 from dolens.rendering.psf_grid import (
     FieldPointSpreadFunctions,
@@ -23,11 +30,9 @@ from dolens.rendering.psf_grid import (
     field_point_spread_functions,
     wave_point_spread_functions,
 )
-from dolens.rendering.pupil.differentiable_pupil import differentiable_exit_pupil
-from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
 from dolens.rendering.relative_illumination import relative_illumination
 from dolens.scene.planar import PlanarScene, as_planes
-from dolens.scene.scene import Scene
+from dolens.scene.scene import Scene, texture_origin
 from dolens.sensor.pixels import Sensor
 
 logger = logging.getLogger(__name__)
@@ -312,3 +317,103 @@ class PsfRenderer(Renderer):
         depths = (scene.middle_depth,) if self.depths == "one" else scene.depths
         wavelengths = (scene.middle_wavelength,) if self.colours == "one" else scene.wavelengths
         return as_planes(scene, depths, wavelengths)
+
+
+@dataclass(frozen=True)
+class PlaneBlur:
+    """Convolution of planes with a lens's kernels, a scene's `Blur`.
+
+    Attributes:
+        kernels: (N, D or 1, C or 1, K, K), differentiable.
+        layout: N patches, and the object points of their pixels.
+        illumination: (C or 1, height, width), what the image of every plane is multiplied by; or
+            None.
+    """
+
+    kernels: Tensor
+    layout: PatchLayout
+    illumination: Tensor | None = None
+
+    def __call__(self, maps: Tensor) -> Tensor:
+        """(B, D, C, height, width) of maps (B, D or 1, C or 1, H, W)."""
+        image = convolve_patches(maps, self.kernels, self.layout)
+        return image if self.illumination is None else image * self.illumination
+
+    def white(self) -> Tensor:
+        """Return the blurred maps of ones, (D or 1, C or 1, height, width)."""
+        image = uniform_image(self.kernels, self.layout)
+        return image if self.illumination is None else image * self.illumination
+
+    def illuminated(self, light: Tensor, wanted: Tensor) -> "PlaneBlur":
+        """The same with kernels of unit light, and a relative illumination found otherwise.
+
+        Pixels whose kernels are partly dark get their light from the others.
+
+        Args:
+            light: (N, C or 1), of each node's kernels.
+            wanted: (C or 1, height, width), of each pixel.
+        """
+        bright = light.detach() > 0.0
+        light = torch.where(bright, light, 1.0)
+        covered, lit = torch.zeros_like(wanted), []
+        for patch, some in zip(self.layout.patches, bright[..., None, None], strict=True):
+            share = torch.where(some, patch.weight, 0.0)
+            covered[:, patch.top : patch.bottom, patch.left : patch.right] += share
+            lit.append(patch._replace(weight=share))
+        scale = wanted / torch.where(covered > 0.0, covered, 1.0)
+        kernels = self.kernels / light[:, None, :, None, None]
+        return PlaneBlur(kernels, replace(self.layout, patches=lit), scale)
+
+
+def places_in_texture(
+    imaging: ImagingSystem, size: tuple[int, int], object_points: tuple[Tensor, Tensor] | None
+) -> tuple[tuple[int, int], Coordinates | None]:
+    """Find the object points of a sensor's pixels in a texture.
+
+    Args:
+        imaging: the sensor, and the scene that says where the texture's centre lies.
+        size: height and width of the texture.
+        object_points: rows and columns where the pixels' chief rays meet the planes, each
+            (D, C, height, width); None: where a pinhole sees them.
+
+    Returns:
+        Row and column of the object point of pixel (0, 0), where the others follow texel by texel,
+        and None; else (0, 0) and the coordinates of all pixels.
+    """
+    scene, sensor = imaging.scene, imaging.sensor
+    row, column = texture_origin(size, scene.texture_centre)
+    if object_points is not None:
+        down, across = object_points
+        return (0, 0), Coordinates(down + row, across + column)
+    top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+    left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+    if top.is_integer() and left.is_integer():
+        return (int(top), int(left)), None
+    options: dict[str, Any] = {"dtype": torch.float64, "device": imaging.system.device}
+    rows, columns = torch.meshgrid(
+        torch.arange(sensor.height, **options),
+        torch.arange(sensor.width, **options),
+        indexing="ij",
+    )
+    shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
+    return (0, 0), Coordinates((rows + top).expand(shape), (columns + left).expand(shape))
+
+
+def uniform_image(kernels: Tensor, layout: PatchLayout) -> Tensor:
+    """Compute what `convolve_patches` makes of ones: Σ over nodes of weight · Σ kernel.
+
+    Args:
+        kernels: (N, D or 1, C or 1, K, K).
+        layout: N patches, all with or all without weights for each channel.
+
+    Returns:
+        (D or 1, C or 1, height, width).
+    """
+    sums = kernels.sum((-2, -1))[..., None, None]
+    channels = max(
+        [sums.shape[2], *(p.weight.shape[0] for p in layout.patches if p.weight.dim() > 2)]
+    )
+    image = sums.new_zeros((sums.shape[1], channels, *layout.image_size))
+    for total, patch in zip(sums, layout.patches, strict=True):
+        image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * total
+    return image

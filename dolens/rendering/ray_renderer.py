@@ -4,7 +4,8 @@ Two implementations of one computation, with the same samples: fused kernels, fo
 images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -17,17 +18,33 @@ from dolens.kernels.view import View
 from dolens.optics.backend import say_once, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
+from dolens.optics.ray_tracing import trace_components
+from dolens.optics.rays import Components
 from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
-from dolens.rendering.differentiable_geometry import DifferentiableGeometry, differentiable_geometry
+from dolens.optics.trace import distance_to_plane
+from dolens.rendering.aperture_edges import (
+    EdgeRays,
+    PupilBoundaryMap,
+    edge_rays,
+    pupil_boundary_map,
+)
+from dolens.rendering.differentiable_geometry import (
+    DifferentiableGeometry,
+    depends_on_parameters,
+    differentiable_geometry,
+    sample_weight,
+)
+from dolens.rendering.exit_pupil import (
+    ExitPupil,
+    axial_exit_pupil,
+    rays_to_exit_pupil,
+    sampled_exit_pupil,
+)
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pixel_rays import PixelRays
 from dolens.rendering.protocol import Renderer, SensorWindow
-from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
-from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
-from dolens.rendering.pupil.pixel_edges import edge_samples
-from dolens.rendering.pupil.pupil_boundary import pupil_boundary_map
-from dolens.scene.scene import Scene, texture_origin
+from dolens.rendering.sampling import random_words, square_to_disc, stratified_square, uniform
+from dolens.scene.scene import Scene, texture_coordinates, texture_origin
 from dolens.sensor.noise import generator_of
 from dolens.sensor.pixels import Sensor
 
@@ -273,3 +290,169 @@ class RayRenderer(Renderer):
 def _sizes(pieces: Sequence[tuple[int, int]]) -> list[int]:
     """Pixels of each piece."""
     return [end - start for start, end in pieces]
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Rays of a sensor's pixels, and the light that they bring from a scene.
+
+    Attributes:
+        scene: planes and wavelengths.
+        sensor: the pixels.
+        view: the same as numbers, with the samples of the pupil and the seed.
+        edges: where apertures end the pixels' light, for gradients; None where they do not.
+    """
+
+    scene: Scene
+    sensor: Sensor
+    view: View
+    edges: PupilBoundaryMap | None = None
+
+    def samples(
+        self, system: OpticalSystem, pupil: ExitPupil, start: int, end: int
+    ) -> tuple[Components, Tensor]:
+        """Rays (pixels, samples) from the sensor, and their weights, which sum to one on axis."""
+        view = self.view
+        side = view.pupil_samples
+        pixel = torch.arange(start, end, device=system.device)[:, None]
+        sample = torch.arange(side * side, device=system.device)
+        jitters = [uniform(word, system.dtype) for word in random_words(view.seed, pixel, sample)]
+        disc_x, disc_y = square_to_disc(*stratified_square(side, *jitters[:2]))
+        rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)
+        columns = (pixel % view.width).to(system.dtype)
+        if view.pixel_area:
+            rows, columns = rows + (jitters[2] - 0.5), columns + (jitters[3] - 0.5)
+        x, y = self.sensor.positions(rows, columns)
+        sensor_z = system.vertices[-1]
+        radius = pupil.radius
+        ray = rays_to_exit_pupil(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
+        return ray, (ray.n * ray.n) ** 2 * sample_weight(system, view, pupil)
+
+    def rim(self, system: OpticalSystem, pupil: ExitPupil, start: int, end: int) -> EdgeRays | None:
+        """Rays along the edges of apertures; None where no gradient asks for them."""
+        imaging = ImagingSystem(system, self.scene, self.sensor, pupil)
+        return pixel_edge_rays(imaging, self.view, self.edges, start, end)
+
+    def light(
+        self,
+        system: OpticalSystem,
+        moving: DifferentiableGeometry,
+        shown: tuple[Tensor, ...],
+        start: int,
+        end: int,
+    ) -> Tensor:
+        """Light of pixels `start` to `end`: (B, images, C, end - start).
+
+        Args:
+            system: the lens.
+            moving: the pupil and the magnifications, as they move with it.
+            shown: what the planes show, of `Scene.on_planes`.
+            start: number of the first pixel.
+            end: number behind the last.
+        """
+        ray, weight = self.samples(system, moving.pupil, start, end)
+        rim = self.rim(system, moving.pupil, start, end)
+        channels = []
+        for channel, wavelength in enumerate(self.scene.wavelengths):
+            there, valid = trace_components(system, ray, wavelength, -1.0)
+            arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
+            if rim is not None:
+                # Rays along the edges stand beside the samples.
+                beside = select_wavelength(rim.ray, channel)
+                there = Components(
+                    *(torch.cat(pair, -1) for pair in zip(there, beside, strict=True))
+                )
+                arriving = torch.cat((arriving, rim.weight[channel]), -1)
+            places = self._texture_places(moving.magnifications, there)
+            channels.append(self.scene.gather(shown, channel, places, arriving))
+        return torch.stack(channels, dim=2)
+
+    def edge_light(
+        self,
+        system: OpticalSystem,
+        moving: DifferentiableGeometry,
+        shown: tuple[Tensor, ...],
+        start: int,
+        end: int,
+        still: Sequence[float],
+    ) -> Tensor:
+        """Zeros (B, images, C, end - start) whose gradients are those of light at apertures' edges.
+
+        Arguments as of `light`, and the magnifications as numbers; of the scene, planes that make
+        images of their own.
+        """
+        rim = self.rim(system, moving.pupil, start, end)
+        depths, wavelengths = self.scene.depths, self.scene.wavelengths
+        if rim is None:
+            shape = (shown[0].shape[0], len(depths), len(wavelengths), end - start)
+            return shown[0].new_zeros(shape)
+        channels = [
+            self.scene.gather(
+                shown,
+                channel,
+                self._texture_places(still, select_wavelength(rim.ray, channel)),
+                rim.weight[channel],
+            )
+            for channel in range(len(wavelengths))
+        ]
+        return torch.stack(channels, dim=2)
+
+    def _texture_places(
+        self, magnifications: Sequence[float | Tensor], there: Components
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Rows and columns of the texture where rays meet one plane after the other."""
+        view = self.view
+        origin = (view.texture_row, view.texture_column)
+        for depth, magnification in zip(view.depths, magnifications, strict=True):
+            t, _ = distance_to_plane(there, -depth, -1.0)
+            x = torch.addcmul(there.x, t, there.l)
+            y = torch.addcmul(there.y, t, there.m)
+            yield texture_coordinates(x, y, magnification, view.pixel_pitch, origin)
+
+
+# Rays a pixel and wavelength, where edges cut light: as many as half the strata along a side of the
+# pupil, since an edge is a line.
+_FEWEST = 2
+
+
+def edge_samples(pupil_samples: int) -> int:
+    """Rays along edges for each pixel and wavelength, beside strata along a side of the pupil."""
+    return max(_FEWEST, pupil_samples // 2)
+
+
+def pixel_edge_rays(
+    imaging: ImagingSystem, view: View, edges: PupilBoundaryMap | None, start: int, end: int
+) -> EdgeRays | None:
+    """Rays (C, pixels, samples) of pixels `start` to `end`; None where no gradient asks for them.
+
+    Args:
+        imaging: the lens, C wavelengths, the pixels, and the pupil's disc as it moves with the
+            lens.
+        view: of the render, for its seed.
+        edges: where edges are; None where they cut nothing.
+        start: number of the first pixel.
+        end: number behind the last.
+    """
+    system = imaging.system
+    if edges is None or not depends_on_parameters(system):
+        return None
+    pixel = torch.arange(start, end, device=system.device)[:, None]
+    count = edge_samples(view.pupil_samples)
+    stratum = torch.arange(count, device=system.device)
+    # Beyond the numbers of the pupil's samples.
+    words = random_words(view.seed, pixel, stratum + view.pupil_samples**2)
+    jitter, _, *area = (uniform(word, system.dtype) for word in words)
+    angle = (stratum + jitter) * (2.0 * math.pi / count)
+    rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)[:, 0]
+    columns = (pixel % view.width).to(system.dtype)[:, 0]
+    if view.pixel_area:
+        # One place serves all azimuths of a pixel.
+        rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
+    points = imaging.sensor.positions(rows, columns)
+    edge = edges.at(*points, angle)
+    return edge_rays(system, imaging.scene.wavelengths, points, imaging.pupil, edge)
+
+
+def select_wavelength(ray: Components, channel: int) -> Components:
+    """Rays of one wavelength."""
+    return Components(*(component[channel] for component in ray))

@@ -19,7 +19,7 @@ from dolens.optics.rays import Components
 from dolens.optics.straight import require_plane_sensor, require_refracting
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
-from dolens.rendering.binning import bin_rays
+from dolens.rendering.psf import bin_rays
 from dolens.sensor.pixels import Sensor
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))

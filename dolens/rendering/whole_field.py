@@ -19,22 +19,22 @@ from torch.nn import functional
 from dolens.errors import InputError
 from dolens.optics.backend import cpu_kernels_serve, with_chosen_backend
 from dolens.optics.lens import Lens
+from dolens.rendering.auto.field_grid import spread_pixels
 from dolens.rendering.auto.plan import Requirements, plan
 from dolens.rendering.auto.probes import grey_levels
-from dolens.rendering.auto.survey import spread_pixels
 from dolens.rendering.chief_ray_map import ChiefRayMap, chief_ray_maps, fit_chief_ray_map
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.patches import PatchLayout, patches
-from dolens.rendering.place_functions import (
+from dolens.rendering.patch_convolution import PatchLayout, patches
+from dolens.rendering.plane_points import chief_ray_points
+from dolens.rendering.psf_grid import (
     SAMPLES,
+    FieldPointSpreadFunctions,
     IdealPlaces,
+    PointShare,
     chief_ray_places,
     place_functions,
 )
-from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
-from dolens.rendering.plane_points import chief_ray_points
-from dolens.rendering.psf_grid import FieldPointSpreadFunctions, PointShare
-from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.psf_renderer import PlaneBlur, PsfRenderer, places_in_texture
 from dolens.rendering.relative_illumination import IlluminationMap
 from dolens.scene.planar import PlanarScene, as_planes
 from dolens.scene.scene import resized, texture_origin

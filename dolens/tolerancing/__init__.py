@@ -1,21 +1,34 @@
 """This package predicts what manufacturing does to a lens: sensitivities, tolerances, yield."""
 
-from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
-from dolens.tolerancing.assembly import FocusTarget, assembled, best_focus
-from dolens.tolerancing.desensitising import expected_spread
-from dolens.tolerancing.linear_spots import LinearSpots, linear_spots
+from dolens.tolerancing.analysis import (
+    Outcome,
+    ToleranceAnalysis,
+    Yield,
+    analyse_tolerances,
+    quantiles,
+    share_within,
+)
+from dolens.tolerancing.assembly import FocusTarget, assembled, best_focus, expected_spread
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
-from dolens.tolerancing.perturbations import Tolerances, scaled_tolerances, tolerances_from
-from dolens.tolerancing.prediction import Contributions, contributions
-from dolens.tolerancing.sensitivity import Sensitivities, sensitivities
-from dolens.tolerancing.through_focus import FocusCurves, spot_weights
-from dolens.tolerancing.usual import (
+from dolens.tolerancing.sensitivity import (
+    Contributions,
+    FocusCurves,
+    LinearSpots,
+    Sensitivities,
+    contributions,
+    linear_spots,
+    sensitivities,
+    spot_weights,
+)
+from dolens.tolerancing.tolerances import (
+    Tolerances,
     fields_all_around,
+    scaled_tolerances,
+    tolerances_from,
     usual_tolerances,
     usual_tolerances_text,
     with_glass_elements,
 )
-from dolens.tolerancing.yields import Yield, quantiles, share_within
 
 __all__ = [
     "Contributions",

@@ -19,8 +19,7 @@ from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tasks import TaskMap
-from dolens.tolerancing.linear_spots import check_whole_pupil
-from dolens.tolerancing.through_focus import FocusCurves
+from dolens.tolerancing.sensitivity import FocusCurves, check_whole_pupil
 
 # Rays that a thread traces at a time: their intermediate results take 0.1 GB.
 RAYS_AT_A_TIME = 1 << 17

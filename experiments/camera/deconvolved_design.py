@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.joined_spots import joined_spots
-from dolens.analysis.pupil_quadrature import with_chief_rays
+from dolens.analysis.pupil_quadrature import joined_spots, with_chief_rays
 from dolens.errors import InputError
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.optimize import DampedLeastSquares
 from dolens.optimize.deconvolved_error import DeconvolvedError, Photographs
-from dolens.optimize.loss_residuals import LossResiduals
 from dolens.optimize.merit import MeritFunction
+from dolens.optimize.ray_intercept_quality import LossResiduals
 from dolens.optimize.variables import DesignVariables
 from dolens.sensor.readout import Readout
 

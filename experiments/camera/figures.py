@@ -17,7 +17,7 @@ from dolens.experiments.experiment import Figures
 from dolens.optics.paraxial import first_order
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
 from dolens.plotting.layout import layout_title, lens_title, optics_text, shown_name
-from dolens.plotting.number_text import number_text
+from dolens.plotting.style import number_text
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.likelihood import depth_picture, depth_probabilities
 from dolens.reconstruction.opponent_wiener import functions_of_each

@@ -15,7 +15,7 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.camera.views.base import Views
 from dolens.experiments.tables import Row
-from dolens.plotting.made_lenses import made_lenses_figure
+from dolens.plotting.tolerances import made_lenses_figure
 from dolens.reconstruction import psnr_db
 from dolens.tolerancing import Tolerances
 

@@ -10,8 +10,8 @@ from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.camera_search.forms import SearchedForm
 from dolens.experiments.camera_search.rungs import Rung, RungOfForm
 from dolens.experiments.running.finished_run import load_run
-from dolens.plotting.comparison import comparison_figure
-from dolens.plotting.spots_and_cameras import CamerasOfRung, spots_and_cameras_figure
+from dolens.plotting.pareto import CamerasOfRung, spots_and_cameras_figure
+from dolens.plotting.pictures import comparison_figure
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb
 

@@ -15,7 +15,7 @@ from dolens.experiments.commands.apply_options import PictureOptions
 from dolens.experiments.commands.picture_files import Picture, read_picture, write_picture
 from dolens.experiments.running.run_files import write_json
 from dolens.plotting import save_figure
-from dolens.plotting.applied_picture import applied_figure
+from dolens.plotting.pictures import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.image_files import format_of
 

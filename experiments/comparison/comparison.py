@@ -24,8 +24,8 @@ from dolens.experiments.comparison.metrics import (
     value_of,
 )
 from dolens.experiments.comparison.rows import Row, Rows, chosen_row, rows_of, text_of
-from dolens.plotting.number_text import with_minus
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
+from dolens.plotting.style import with_minus
 from dolens.reconstruction.quality import Interval
 
 NONE = "–"

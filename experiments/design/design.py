@@ -34,8 +34,8 @@ from dolens.experiments.experiment import Experiment, Figures
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
-from dolens.optimize.start import start_values
 from dolens.optimize.states import StatesMerit, StatesValue
+from dolens.optimize.variables import start_values
 from dolens.prescriptions import lens_from_prescription
 from dolens.tasks import stage
 

@@ -36,7 +36,7 @@ from dolens.plotting import (
     spots_figure,
 )
 from dolens.plotting.layout import optics_text, shown_name
-from dolens.plotting.number_text import number_text
+from dolens.plotting.style import number_text
 
 _FREQUENCIES = 201
 # Along each diameter of the stop.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritFunction
-from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.states import StatesMerit, StatesValue
 

@@ -20,15 +20,15 @@ from dolens.analysis.modulation_transfer import (
     modulation_transfer,
 )
 from dolens.analysis.ray_intercepts import field_unit
-from dolens.analysis.rms_curves import RMSCurves
 from dolens.analysis.spot_diagram import (
     AIRY,
+    RMSCurves,
     SpotDiagram,
     moments,
     spot_diagram,
     working_f_numbers,
 )
-from dolens.diffraction.transfer import diffraction_modulation
+from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.errors import InputError
 from dolens.experiments.design.merit_pupil import is_grid, pupil_f_numbers, pupil_share
 from dolens.experiments.design.tables import spot_table
@@ -98,7 +98,7 @@ def merit_modulation(
     Over the whole stop it is the pupil's autocorrelation.  Over a grid within the stop, and where
     spots are many Airy discs large, it is the contrast of the rays times the diffraction limit.
     The product is right where aberrations are far below a wavelength, and where they are many
-    wavelengths (see `dolens.diffraction.diffraction_limit`).
+    wavelengths (see `dolens.diffraction.pixel_psf`).
 
     Returns:
         The MTF, and labels of the fields that are such products.

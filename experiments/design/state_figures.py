@@ -18,8 +18,8 @@ from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from dolens.plotting import modulation_figure, spots_comparison_figure
 from dolens.plotting.layout import shown_name
-from dolens.plotting.number_text import number_text
-from dolens.plotting.states import states_field_curves_figure, states_layout_figure
+from dolens.plotting.lens_section import states_field_curves_figure, states_layout_figure
+from dolens.plotting.style import number_text
 
 _FREQUENCIES = 101
 # Beyond this over the RMS radius a spot's modulation is nearly nothing.

@@ -10,8 +10,7 @@ from dolens.experiments.experiment import Figures
 from dolens.experiments.lens_search.finds import Finds
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.search_report import search_course, sections_figure, start_map
-from dolens.plotting.search_course import search_course_figure
-from dolens.plotting.starts import starts_figure
+from dolens.plotting.search import search_course_figure, starts_figure
 
 
 def search_figures(finds: Finds, reports: Sequence[FormReport], name: str) -> Figures:

@@ -11,11 +11,16 @@ from dolens.alignment.pose import Pose
 from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.labels import variable_label
 from dolens.experiments.tables import Row
-from dolens.plotting.legends import legend_below
-from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
-from dolens.plotting.ticks import log_ticks
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    colours,
+    draw_title,
+    legend_below,
+    log_ticks,
+    number_text,
+    ruled_axes,
+)
 from dolens.rendering.spot_image import SpotImager
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}

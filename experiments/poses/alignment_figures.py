@@ -10,9 +10,16 @@ from torch import Tensor
 
 from dolens.alignment.moments import Pixels
 from dolens.experiments.poses.alignment_result import COLUMNS, Alignment
-from dolens.plotting.style import DASHES, PAGE, SMALL, TITLE, colours, ruled_axes
-from dolens.plotting.ticks import log_ticks
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import (
+    DASHES,
+    PAGE,
+    SMALL,
+    TITLE,
+    colours,
+    draw_title,
+    log_ticks,
+    ruled_axes,
+)
 
 _PANELS = (("tilt", slice(0, 2), "°"), ("decentre", slice(2, 4), "µm"))
 

@@ -13,12 +13,20 @@ from matplotlib.ticker import MaxNLocator
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
 from dolens.experiments.poses.labels import variable_label
-from dolens.plotting.corner import corner_figure
-from dolens.plotting.legends import legend_below
-from dolens.plotting.number_text import MINUS, number_text
-from dolens.plotting.style import DASHES, MARKERS, PAGE, SMALL, colours, ruled_axes
-from dolens.plotting.ticks import log_ticks
-from dolens.plotting.titles import draw_title
+from dolens.plotting.parameter_fits import corner_figure
+from dolens.plotting.style import (
+    DASHES,
+    MARKERS,
+    MINUS,
+    PAGE,
+    SMALL,
+    colours,
+    draw_title,
+    legend_below,
+    log_ticks,
+    number_text,
+    ruled_axes,
+)
 
 
 def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:

@@ -12,9 +12,8 @@ from dolens.alignment.chart_model import ChartModel
 from dolens.experiments.poses.chart_restoration import ARMS
 from dolens.experiments.poses.chart_result import FittedSpecimen, restored
 from dolens.plotting.captions import plain_text
-from dolens.plotting.style import PAGE, SMALL, colours, open_axes
-from dolens.plotting.titles import draw_title
-from dolens.rendering.binning import bin_rays
+from dolens.plotting.style import PAGE, SMALL, colours, draw_title, open_axes
+from dolens.rendering.psf import bin_rays
 
 # Half the side of what is drawn of a mark, in widths of its spot.
 _SEEN = 4.0

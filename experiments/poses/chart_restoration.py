@@ -14,7 +14,7 @@ from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
 from dolens.experiments.data.photos import TEST, VALIDATION, read_installed
 from dolens.experiments.poses.chart_settings import Restoration
 from dolens.reconstruction.wiener import transfer_function, wiener_deconvolve
-from dolens.rendering.binning import bin_rays
+from dolens.rendering.psf import bin_rays
 from dolens.sensor.colour import srgb_to_linear
 from dolens.sensor.noise import generator_of
 

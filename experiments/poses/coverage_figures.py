@@ -6,10 +6,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.plotting.legends import legend_below
-from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, SMALL, colours, open_axes
-from dolens.plotting.titles import draw_axes_title
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    colours,
+    draw_axes_title,
+    legend_below,
+    number_text,
+    open_axes,
+)
 
 
 def coverage_figure(

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from dolens.plotting.number_text import number_text
+from dolens.plotting.style import number_text
 
 
 def variable_label(name: str) -> str:

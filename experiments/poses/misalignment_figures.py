@@ -19,10 +19,9 @@ from dolens.experiments.poses.labels import image_labels, variable_label
 from dolens.experiments.poses.settings import Fit, Stage
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from dolens.plotting.convergence import convergence_figure
-from dolens.plotting.corner import corner_figure
 from dolens.plotting.layout import lens_title
-from dolens.plotting.spot_fit import spot_fit_figure
+from dolens.plotting.parameter_fits import convergence_figure, corner_figure
+from dolens.plotting.pictures import spot_fit_figure
 from dolens.rendering.spot_image import SpotImage
 from dolens.sensor.pixels import Sensor
 

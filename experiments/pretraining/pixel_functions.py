@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dolens.diffraction.field import fourier_field
-from dolens.diffraction.pixel_integration import fine_grid, pixel_matrix
+from dolens.diffraction.pixel_psf import fine_grid, pixel_matrix
+from dolens.diffraction.propagation import fourier_field
 from dolens.diffraction.pupil_fit import RegularPupil
 from dolens.diffraction.wavefront import MM_PER_NM
 from dolens.rendering.psf import splat

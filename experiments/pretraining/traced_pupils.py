@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pupil_fit import PupilFit, fit_pupil, regular_pupil
 from dolens.diffraction.reference_sphere import chief_ray_intercepts
 from dolens.diffraction.wavefront import pupil_wavefront
@@ -16,8 +16,7 @@ from dolens.experiments.pretraining.random_pupils import COARSE, GREEN, Draw
 from dolens.files import packaged_configuration
 from dolens.optics.lens import Lens
 from dolens.prescriptions.files import load_lens
-from dolens.tolerancing.perturbations import tolerances_from
-from dolens.tolerancing.usual import usual_tolerances, with_glass_elements
+from dolens.tolerancing.tolerances import tolerances_from, usual_tolerances, with_glass_elements
 
 # The restorer is judged by these lenses, so that none of its training functions come from them.
 HELD_OUT = (

@@ -6,8 +6,8 @@ import torch
 
 from dolens.experiments.speed.renders import Subject
 from dolens.experiments.speed.timing import by_turns
+from dolens.rendering.auto.field_grid import spread_pixels, survey
 from dolens.rendering.auto.probes import grey_levels
-from dolens.rendering.auto.survey import spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
 
 _POINTS, _TRUE_SAMPLES, _SIZE = 9, 160, 65

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from dolens.experiments.speed.timing import by_turns, peak_megabytes
 from dolens.optics.lens import Lens
-from dolens.rendering.auto.agreement import (
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.auto.probes import Reference, probe_image, reference
+from dolens.rendering.gradient_check import (
     Agreement,
     Render,
     agreement,
@@ -17,8 +19,6 @@ from dolens.rendering.auto.agreement import (
     image_measure,
     reference_strata,
 )
-from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.probes import Reference, probe_image, reference
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer

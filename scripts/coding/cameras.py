@@ -12,13 +12,13 @@ import yaml
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.diffraction.diffraction_limit import with_diffraction_limit
+from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.experiments.camera.views.whole import axial_function
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
 from dolens.reconstruction.wiener import linear_error_of_readouts, natural_spectrum
+from dolens.rendering.exit_pupil import axial_f_number
 from dolens.rendering.psf import axial_point_spread_functions
-from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 

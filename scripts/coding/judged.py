@@ -10,8 +10,7 @@ from torch import Tensor
 
 from dolens.experiments.data.photos import PhotosDataModule
 from dolens.experiments.pretraining.examples import blurred
-from dolens.plotting.style import PAGE, SMALL
-from dolens.plotting.titles import draw_title
+from dolens.plotting.style import PAGE, SMALL, draw_title
 from dolens.reconstruction import GeneralRestoration, Restoration, WienerTVRestoration, psnr_db
 from dolens.reconstruction.likelihood import estimated_motion
 from dolens.reconstruction.quality import Interval, gain_interval

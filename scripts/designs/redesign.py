@@ -15,7 +15,7 @@ from dolens.optics.lens import Lens
 from dolens.optimize import DampedLeastSquares, DesignVariables
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import operand
-from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
 from scripts.designs.files import Design
 from scripts.designs.lenses import (
     Measures,

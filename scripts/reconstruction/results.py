@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.experiments.camera.photograph_scores import format_interval
-from dolens.plotting.quality_over_time import Curve
+from dolens.plotting.runs import Curve
 from dolens.reconstruction.quality import Interval, bootstrap_interval, gain_interval
 
 

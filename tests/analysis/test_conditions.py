@@ -9,11 +9,11 @@ from dolens import load_lens
 from dolens.analysis.conditions import (
     conditions,
     field_scans,
+    full_field,
     own_fields,
     spectral_lines,
     wavelength_interval,
 )
-from dolens.analysis.full_field import full_field
 from dolens.errors import InputError
 from dolens.optics.aperture_setting import with_aperture
 from dolens.prescriptions import lens_from_prescription

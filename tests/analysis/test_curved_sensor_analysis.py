@@ -23,7 +23,7 @@ from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import LensProperties, operand
-from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 from dolens.plotting.section import sensor_curve
@@ -31,7 +31,7 @@ from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
-from dolens.tolerancing.linear_spots import linear_spots
+from dolens.tolerancing.sensitivity import linear_spots
 from tests.optics.test_curved_sensor import mirror
 
 # Of the sensor about the centre: a little more than the focal length, so that spots have a size.

@@ -13,11 +13,10 @@ from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
-from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
-from dolens.analysis.spot_diagram import spot_diagram
+from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength, spot_diagram
 from dolens.errors import InputError
 from dolens.optics.paraxial import chief_ray_magnification
-from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)

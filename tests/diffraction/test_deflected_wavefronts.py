@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.prescriptions import lens_from_prescription
 

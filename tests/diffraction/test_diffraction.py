@@ -10,8 +10,8 @@ from scipy.integrate import quad, simpson
 from scipy.special import j0, j1, jn_zeros
 
 from dolens import Lens, load_lens
-from dolens.diffraction.field import direct_field, fourier_field
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.propagation import direct_field, fourier_field
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.reference_sphere import path_beyond
 from dolens.diffraction.wavefront import pupil_wavefront

@@ -9,11 +9,10 @@ from scipy.special import j1
 
 from dolens import load_lens
 from dolens.analysis.modulation_transfer import diffraction_limited_transfer
-from dolens.diffraction.huygens import huygens_irradiance, huygens_point_spread
-from dolens.diffraction.huygens_transfer import huygens_modulation
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.huygens import huygens_irradiance, huygens_modulation, huygens_point_spread
+from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import point_spread
-from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture

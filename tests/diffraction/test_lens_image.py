@@ -12,9 +12,9 @@ from dolens.analysis.conditions import field_scans
 from dolens.analysis.modulation_transfer import diffraction_limited_transfer, modulation
 from dolens.diffraction.huygens import huygens_point_spread
 from dolens.diffraction.illumination import relative_illumination
+from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import diffraction_encircled_energy, point_spread
-from dolens.diffraction.transfer import diffraction_modulation
-from dolens.diffraction.wavefront_error import wavefront_errors
+from dolens.diffraction.wavefront_map import wavefront_errors
 from dolens.errors import InputError
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.prescriptions import lens_from_prescription

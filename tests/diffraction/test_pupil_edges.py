@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.wavefront import coverage
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle, Unlimited
 
 

@@ -10,16 +10,17 @@ from scipy.integrate import dblquad, quad
 from scipy.special import j1
 
 from dolens import load_lens
-from dolens.diffraction import psf as wave_psf
-from dolens.diffraction.object_points import ObjectPoints
-from dolens.diffraction.pixel_integration import (
+from dolens.diffraction import pixel_psf as wave_psf
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.pixel_psf import (
     PixelWindow,
     fine_grid,
     pixel_matrix,
+    propagation,
     quadratic_b_spline,
+    wave_kernels,
 )
 from dolens.diffraction.propagation import DiffractionSettings, choose_propagation
-from dolens.diffraction.psf import propagation, wave_kernels
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError

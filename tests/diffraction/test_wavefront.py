@@ -9,8 +9,7 @@ from scipy.integrate import dblquad
 
 from dolens import Lens, load_lens
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
-from dolens.diffraction.entrance_beam import find_beam
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints, find_beam
 from dolens.diffraction.pupil_fit import chebyshev, fit_pupil
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
 from dolens.errors import InputError

@@ -7,7 +7,7 @@ import torch
 from scipy.integrate import quad
 
 from dolens import load_lens
-from dolens.diffraction.strehl import marechal, strehl_ratios
+from dolens.diffraction.point_spread import marechal, strehl_ratios
 from dolens.diffraction.wavefront_map import wavefront_maps
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import dolens
-from dolens.diffraction.pixel_integration import quadratic_b_spline
+from dolens.diffraction.pixel_psf import quadratic_b_spline
 from dolens.diffraction.pupil_fit import regular_pupil
 from dolens.errors import InputError
 from dolens.experiments.pretraining import pixel_functions as module

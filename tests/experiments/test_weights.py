@@ -10,11 +10,10 @@ from dolens import load_lens, save_lens
 from dolens.analysis.conditions import conditions
 from dolens.analysis.encircled_energy import encircled_energy
 from dolens.analysis.modulation_transfer import frequency_range, modulation
-from dolens.analysis.rms_curves import rms_against_field
-from dolens.analysis.spot_diagram import spot_diagram
+from dolens.analysis.spot_diagram import rms_against_field, spot_diagram
 from dolens.diffraction.huygens import huygens_point_spread, huygens_window
+from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import diffraction_encircled_energy, point_spread
-from dolens.diffraction.transfer import diffraction_modulation
 from dolens.errors import InputError
 from dolens.experiments.design.merit_rays import (
     merit_modulation,

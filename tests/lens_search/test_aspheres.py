@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dolens.analysis.parabasal import parabasal_rays
+from dolens.analysis.field_curves import parabasal_rays
 from dolens.errors import InputError
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs, designed_lens

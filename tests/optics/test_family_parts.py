@@ -7,7 +7,7 @@ import dolens
 from dolens import Rays
 from dolens.optics.family_parts import intercept_parts, jacobian_parts
 from dolens.optics.lens_family import LensFamily, shared_rays
-from dolens.tolerancing.usual import with_glass_elements
+from dolens.tolerancing.tolerances import with_glass_elements
 
 LENSES, RAYS = 7, 50
 NAMES = {

@@ -7,7 +7,7 @@ import torch
 from matplotlib.path import Path as Outline
 
 from dolens import InputError, Rays, Status
-from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.wavefront import coverage
 from dolens.optics.thermal_lens import lens_at
 from dolens.prescriptions import lens_from_prescription, prescription_of
 

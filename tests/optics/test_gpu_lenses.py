@@ -6,7 +6,7 @@ import torch
 import dolens
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.lens_family import FamilyRays, LensFamily
-from dolens.tolerancing.usual import with_glass_elements
+from dolens.tolerancing.tolerances import with_glass_elements
 
 pytestmark = [
     pytest.mark.gpu,

@@ -11,7 +11,7 @@ from dolens import Rays
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.lens_family import FamilyRays, LensFamily
 from dolens.optics.ray_tracing import trace_rays
-from dolens.tolerancing.usual import with_glass_elements
+from dolens.tolerancing.tolerances import with_glass_elements
 
 WAVELENGTHS = (656.2725, 587.5618, 486.1327)
 NAMES = ["surfaces.*.curvature", "thicknesses.*", "sensor_distance"]

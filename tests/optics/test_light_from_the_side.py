@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, Status
-from dolens.analysis.parabasal import parabasal_rays
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.analysis.field_curves import parabasal_rays
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.optics.launching import field_line
-from dolens.plotting.drawing import layout_drawing
+from dolens.plotting.layout import layout_drawing
 from dolens.prescriptions.build import lens_from_prescription
 
 RADIUS, INDEX = 10.0, 1.5

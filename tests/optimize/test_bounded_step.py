@@ -7,8 +7,12 @@ import pytest
 import torch
 from scipy.optimize import lsq_linear
 
-from dolens.optimize.bounded_step import bounded_step, damped_step, projected_step
-from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.linear_least_squares import (
+    LinearModel,
+    bounded_step,
+    damped_step,
+    projected_step,
+)
 
 INFINITE = float("inf")
 

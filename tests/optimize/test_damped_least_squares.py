@@ -10,9 +10,12 @@ from dolens.errors import InputError
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optimize import DampedLeastSquares
 from dolens.optimize.batch_least_squares import BatchModel, minimise_batch
-from dolens.optimize.bounded_step import bounded_step
-from dolens.optimize.linear_model import LinearModel
-from dolens.optimize.residuals import TensorResiduals, _say_reverse
+from dolens.optimize.linear_least_squares import (
+    LinearModel,
+    TensorResiduals,
+    _say_reverse,
+    bounded_step,
+)
 from tests.optimize.standard_problems import CERTIFIED, MORE
 
 # From these two of NIST's harder starts it does not get there.  BoxBOD: the first step leads to

@@ -12,7 +12,7 @@ from dolens.optimize.deconvolved_error import (
     Photographs,
     luminance_spectrum,
 )
-from dolens.optimize.loss_residuals import RayGroups
+from dolens.optimize.ray_intercept_quality import RayGroups
 
 PITCH, NOISE = 0.005, 2e-3
 # Power of both differences of colours over that of luminance, in photographs.

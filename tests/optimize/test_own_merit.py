@@ -8,7 +8,7 @@ import torch
 from dolens import InputError, load_lens
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
 from dolens.optimize.operands import Operand
-from dolens.optimize.ray_intercept_losses import SpotSize
+from dolens.optimize.ray_intercept_quality import SpotSize
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dolens import InputError
 from dolens.alignment.pose import Pose
 from dolens.optics.parameter_units import file_value, to_file_units, to_lens_units, unit_of
 from dolens.optimize import DesignVariables
-from dolens.optimize.start import start_values
+from dolens.optimize.variables import start_values
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.tolerancing import tolerances_from
 

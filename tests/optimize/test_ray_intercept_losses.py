@@ -11,9 +11,8 @@ from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
 from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
-from dolens.optimize.choice import by_number_of_variables
-from dolens.optimize.loss_residuals import RayGroups
-from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation
+from dolens.optimize.ray_intercept_quality import EncircledEnergy, Modulation, RayGroups
+from dolens.optimize.variables import by_number_of_variables
 
 
 def disc(radius_mm, rings=60, arms=64):

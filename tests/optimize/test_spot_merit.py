@@ -14,10 +14,10 @@ from dolens.analysis.pupil_quadrature import (
 )
 from dolens.errors import InputError
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
-from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
+from dolens.optimize.linear_least_squares import damped_step
 from dolens.optimize.merit_settings import LOSSES
-from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -252,11 +252,11 @@ def test_the_jacobian_is_that_of_forward_mode(triplet):
 
 
 def test_sums_serve_where_rows_would_not_fit(triplet, monkeypatch):
-    from dolens.optimize import ray_intercept_residuals
+    from dolens.optimize import ray_intercept_quality
 
     merit, _ = merit_of(triplet, sampling="square_grid", sampling_options={"count": 21})
     rows = merit().linear_model()
-    monkeypatch.setattr(ray_intercept_residuals, "MOST_STORED", 0)
+    monkeypatch.setattr(ray_intercept_quality, "MOST_STORED", 0)
     sums = merit().linear_model()
     assert torch.allclose(sums.gradient, rows.gradient, rtol=1e-8)
     assert torch.allclose(sums.root.T @ sums.root, rows.root.T @ rows.root, rtol=1e-8)

@@ -7,9 +7,8 @@ from matplotlib.patches import Ellipse
 
 from dolens.errors import InputError
 from dolens.experiments.poses.labels import image_labels
-from dolens.plotting.convergence import convergence_figure
-from dolens.plotting.corner import corner_figure
-from dolens.plotting.spot_fit import spot_fit_figure
+from dolens.plotting.parameter_fits import convergence_figure, corner_figure
+from dolens.plotting.pictures import spot_fit_figure
 
 COVARIANCE = torch.tensor([[4.0, 1.0, -0.5], [1.0, 1.0, 0.2], [-0.5, 0.2, 9.0]])
 LABELS, UNITS = ["a", "b", "c"], ["mm", "mm", "deg"]

@@ -9,8 +9,7 @@ import torch
 from dolens import load_lens
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.analysis.ray_fans import RayFans
-from dolens.analysis.rms_curves import RMSCurves
-from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
+from dolens.analysis.spot_diagram import RMSCurves, SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.plotting import (
     before_after_figure,

@@ -1,6 +1,6 @@
 """The figure of where coding wins shows what it is given."""
 
-from dolens.plotting.coding_gain import GainRange, coding_gain_figure
+from dolens.plotting.pareto import GainRange, coding_gain_figure
 
 
 def test_points_bars_and_bounds_are_where_the_numbers_say():

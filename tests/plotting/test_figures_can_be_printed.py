@@ -12,8 +12,7 @@ from overlaps import drawn_points, flaws
 from dolens import load_lens
 from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_fans import ray_fans
-from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
-from dolens.analysis.spot_diagram import spot_diagram
+from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength, spot_diagram
 from dolens.plotting import (
     Point,
     before_after_figure,
@@ -28,11 +27,10 @@ from dolens.plotting import (
     spots_comparison_figure,
     spots_figure,
 )
-from dolens.plotting.coding_gain import GainRange, coding_gain_figure
-from dolens.plotting.convergence import convergence_figure
-from dolens.plotting.corner import corner_figure
-from dolens.plotting.psf import window_of_light
-from dolens.plotting.spot_fit import spot_fit_figure
+from dolens.plotting.parameter_fits import convergence_figure, corner_figure
+from dolens.plotting.pareto import GainRange, coding_gain_figure
+from dolens.plotting.pictures import spot_fit_figure
+from dolens.plotting.point_spread import window_of_light
 from dolens.plotting.tolerances import matrix_figure, offenders_figure, yield_figure
 
 WAVES = [656.2725, 587.5618, 486.1327]

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
 from dolens.lens_page import write_page
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.plotting import layout_figure
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
+from dolens.rendering.exit_pupil import axial_exit_pupil
 from tests.optics.test_coordinate_breaks import newtonian
 
 F64 = torch.float64

@@ -12,17 +12,18 @@ from dolens.analysis.encircled_energy import encircled_energy
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.diffraction.illumination import relative_illumination
+from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import diffraction_encircled_energy, point_spread
-from dolens.diffraction.transfer import diffraction_modulation
 from dolens.errors import InputError
 from dolens.plotting.captions import caption, plain_text, wavelengths_text
-from dolens.plotting.encircled_energy import encircled_energy_figure
-from dolens.plotting.field_curves import field_curves_figure
-from dolens.plotting.illumination import illumination_figure
-from dolens.plotting.lateral_colour import lateral_colour_figure
+from dolens.plotting.field_curves import (
+    field_curves_figure,
+    illumination_figure,
+    lateral_colour_figure,
+)
 from dolens.plotting.lens_section import lens_section_figure
-from dolens.plotting.modulation_comparison import modulation_comparison_figure
-from dolens.plotting.point_spread import point_spread_figure
+from dolens.plotting.modulation import modulation_comparison_figure
+from dolens.plotting.point_spread import encircled_energy_figure, point_spread_figure
 
 LINES = (656.2725, 587.5618, 486.1327)
 DARK = [(0.0, 0.0), (0.0, 45.0)]

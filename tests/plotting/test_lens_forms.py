@@ -7,9 +7,8 @@ from overlaps import flaws
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.plotting.forms import FormPicture, form_section, forms_figure
-from dolens.plotting.search_course import search_course_figure
-from dolens.plotting.starts import starts_figure
+from dolens.plotting.search import search_course_figure, starts_figure
+from dolens.plotting.small_sections import FormPicture, form_section, forms_figure
 
 
 @pytest.fixture(scope="module")

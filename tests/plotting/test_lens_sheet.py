@@ -3,7 +3,7 @@
 import pytest
 
 from dolens import load_lens
-from dolens.plotting.lens_sheet import lens_sheet_figure
+from dolens.plotting.small_sections import lens_sheet_figure
 
 NAME = "published/paraboloid_off_axis_100"
 

@@ -3,8 +3,7 @@
 import pytest
 
 from dolens.optics.fields import field_label
-from dolens.plotting.number_text import number_text, value_and_error, with_minus
-from dolens.plotting.style import line_styles
+from dolens.plotting.style import line_styles, number_text, value_and_error, with_minus
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Networks of a figure of quality against seconds are told apart, and have their intervals."""
 
-from dolens.plotting.quality_over_time import Curve, quality_figure
+from dolens.plotting.runs import Curve, quality_figure
 
 
 def test_every_network_has_a_line_with_its_intervals():

@@ -6,7 +6,7 @@ import pytest
 from dolens import InputError
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.field_curves import field_curves
-from dolens.plotting.states import states_field_curves_figure, states_layout_figure
+from dolens.plotting.lens_section import states_field_curves_figure, states_layout_figure
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.test_lens_states import DOUBLET
 

@@ -5,7 +5,7 @@ import math
 import pytest
 from matplotlib.figure import Figure
 
-from dolens.plotting.ticks import log_ticks
+from dolens.plotting.style import log_ticks
 
 
 def ticks(low, high, most=8):

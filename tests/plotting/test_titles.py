@@ -7,9 +7,7 @@ from overlaps import flaws
 
 from dolens import load_lens
 from dolens.plotting import before_after_figure, history_figure
-from dolens.plotting.legends import legend_below
-from dolens.plotting.style import TITLE
-from dolens.plotting.titles import draw_axes_title, draw_title
+from dolens.plotting.style import TITLE, draw_axes_title, draw_title, legend_below
 
 LONG = "Tilted singlet with a freeform corrector: f = 49.83 mm, F/4.98 at 587.6 nm\nmean RMS"
 

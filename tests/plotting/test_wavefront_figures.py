@@ -7,11 +7,10 @@ from matplotlib.collections import QuadMesh
 from dolens import load_lens
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.footprint import footprint
-from dolens.diffraction.strehl import strehl_ratios
+from dolens.diffraction.point_spread import strehl_ratios
 from dolens.diffraction.wavefront_map import wavefront_maps
 from dolens.plotting.footprint import footprint_figure
-from dolens.plotting.strehl import strehl_figure
-from dolens.plotting.wavefront_maps import wavefront_maps_figure, zernike_figure
+from dolens.plotting.wavefront_maps import strehl_figure, wavefront_maps_figure, zernike_figure
 from tests.plotting.overlaps import flaws
 
 FIELDS = [(0.0, 0.0), (0.0, 20.0), (0.0, 45.0)]

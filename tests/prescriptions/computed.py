@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import conditions
-from dolens.analysis.full_field import full_field
+from dolens.analysis.conditions import conditions, full_field
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.optics.fields import vignetting_margin

@@ -8,14 +8,9 @@ import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.rendering.auto.agreement import (
-    Agreement,
-    agreement,
-    gradient,
-    gradients_of_rays,
-)
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.probes import CONTRAST, MEAN, fine_detail
+from dolens.rendering.gradient_check import Agreement, agreement, gradient, gradients_of_rays
 from dolens.rendering.protocol import GradientMeasure
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor

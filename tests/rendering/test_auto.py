@@ -9,11 +9,11 @@ import torch
 from scipy.integrate import dblquad
 
 from dolens import load_lens
-from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
+from dolens.diffraction.pixel_psf import diffraction_transfer, with_diffraction_limit
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.costs import psf_cost
+from dolens.rendering.auto.field_grid import psf_cost
 from dolens.rendering.auto.probes import (
     GREY_LEVEL,
     grey_levels,
@@ -23,8 +23,8 @@ from dolens.rendering.auto.probes import (
     reference,
 )
 from dolens.rendering.auto.trial import with_values
+from dolens.rendering.exit_pupil import ExitPupil
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor

@@ -11,9 +11,9 @@ from dolens import load_lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.probes import GREY_LEVEL, fine_detail, probe_image
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.exit_pupil import axial_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import SensorWindow
-from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor

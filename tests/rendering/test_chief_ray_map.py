@@ -7,11 +7,11 @@ import yaml
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering import chief_ray_map as module
 from dolens.rendering.chief_ray_map import chief_ray_maps, fit_chief_ray_map
+from dolens.rendering.exit_pupil import axial_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
 from dolens.rendering.protocol import SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 

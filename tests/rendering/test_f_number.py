@@ -9,7 +9,7 @@ import yaml
 import dolens
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.pupil.f_number import axial_f_number
+from dolens.rendering.exit_pupil import axial_f_number
 from dolens.sensor.readout import Readout
 
 # Where a colour is uniform, the standard error of a standard deviation is 1/√(2n) of it.

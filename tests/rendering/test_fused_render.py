@@ -10,9 +10,8 @@ from dolens.kernels import rendering
 from dolens.optics.rays import Rays, Status
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.differentiable_geometry import differentiable_geometry
-from dolens.rendering.pixel_rays import PixelRays
-from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
-from dolens.rendering.ray_renderer import RayRenderer
+from dolens.rendering.exit_pupil import sampled_exit_pupil
+from dolens.rendering.ray_renderer import PixelRays, RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dolens import load_lens
-from dolens.diffraction.pixel_integration import PixelWindow
-from dolens.diffraction.psf import wave_kernels
+from dolens.diffraction.pixel_psf import PixelWindow, wave_kernels
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.build import prescription_of

@@ -6,10 +6,16 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.rendering.patch_convolution import convolve_patches, transform_length
-from dolens.rendering.patches import Coordinates, PatchLayout, node_positions, patches
-from dolens.rendering.plane_blur import uniform_image
+from dolens.rendering.patch_convolution import (
+    Coordinates,
+    PatchLayout,
+    convolve_patches,
+    node_positions,
+    patches,
+    transform_length,
+)
 from dolens.rendering.psf import splat
+from dolens.rendering.psf_renderer import uniform_image
 
 
 def random(*shape, seed=0):

@@ -7,9 +7,9 @@ import torch
 
 from dolens import load_lens
 from dolens.experiments.camera.views.fields import FieldViews
+from dolens.rendering.exit_pupil import ExitPupil
 from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import srgb_to_linear

@@ -13,12 +13,11 @@ from dolens.optics.elements import Element, ElementState
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.probes import probe_image
+from dolens.rendering.exit_pupil import rays_to_exit_pupil, sampled_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_grid import field_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
-from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.rendering.relative_illumination import relative_illumination
 from dolens.scene.planar import PlanarScene

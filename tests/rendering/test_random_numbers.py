@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from dolens.rendering.random_numbers import random_words, uniform
+from dolens.rendering.sampling import random_words, uniform
 
 MASK = 2**32 - 1
 

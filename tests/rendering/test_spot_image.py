@@ -9,7 +9,7 @@ from torch.func import jvp
 
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.binning import bin_rays
+from dolens.rendering.psf import bin_rays
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 

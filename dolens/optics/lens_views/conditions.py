@@ -61,6 +61,6 @@ def title_of(what: str, lens: Lens, given: Conditions) -> str:
 
 def shown(figure: Figure) -> Figure:
     """Return a figure that a notebook shows, once, whether pyplot was imported or not."""
-    from dolens.plotting.notebook import showing
+    from dolens.plotting.export import showing
 
     return showing(figure)

@@ -49,7 +49,7 @@ class ImagePointViews:
             aperture: see the class.
         """
         from dolens.analysis.spot_diagram import spot_diagram
-        from dolens.plotting.spots import spots_figure
+        from dolens.plotting.spots_and_ray_fans import spots_figure
 
         lens, given = looked_at(self.spots, fields, wavelengths, object_distance, aperture)
         spots = spot_diagram(lens, given.fields, given.wavelengths, rays, given.object_distance)
@@ -64,7 +64,7 @@ class ImagePointViews:
     ) -> Figure:
         """Plot transverse ray aberrations; see `analysis.ray_fans.ray_fans`."""
         from dolens.analysis.ray_fans import ray_fans
-        from dolens.plotting.ray_fans import ray_fans_figure
+        from dolens.plotting.spots_and_ray_fans import ray_fans_figure
 
         lens, given = looked_at(self.ray_fans, fields, wavelengths, object_distance, aperture)
         fans = ray_fans(
@@ -101,9 +101,9 @@ class ImagePointViews:
         """
         check_kind(kind)
         from dolens.analysis.modulation_transfer import frequency_range, modulation
-        from dolens.diffraction.huygens_transfer import huygens_modulation
-        from dolens.diffraction.transfer import diffraction_modulation
-        from dolens.plotting.modulation_comparison import modulation_comparison_figure
+        from dolens.diffraction.huygens import huygens_modulation
+        from dolens.diffraction.modulation_transfer import diffraction_modulation
+        from dolens.plotting.modulation import modulation_comparison_figure
 
         lens, given = looked_at(self.mtf, fields, wavelengths, object_distance, aperture)
         scene = given.fields, given.wavelengths
@@ -138,7 +138,7 @@ class ImagePointViews:
         """
         from dolens.analysis.encircled_energy import encircled_energy
         from dolens.diffraction.point_spread import diffraction_encircled_energy
-        from dolens.plotting.encircled_energy import encircled_energy_figure
+        from dolens.plotting.point_spread import encircled_energy_figure
 
         lens, given = looked_at(
             self.encircled_energy, fields, wavelengths, object_distance, aperture

@@ -67,7 +67,7 @@ class OverFieldViews:
         """
         from dolens.analysis.conditions import field_scans, spectral_lines
         from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
-        from dolens.plotting.lateral_colour import lateral_colour_figure
+        from dolens.plotting.field_curves import lateral_colour_figure
 
         lines = spectral_lines(as_lens(self)) if wavelengths is None else wavelengths
         lens, given = looked_at(self.lateral_colour, 0.0, lines, object_distance, aperture)
@@ -105,8 +105,8 @@ class OverFieldViews:
             aperture: see the class.
         """
         from dolens.analysis.conditions import field_scans, wavelength_interval
-        from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
-        from dolens.plotting.rms_curves import rms_curves_figure
+        from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength
+        from dolens.plotting.field_curves import rms_curves_figure
 
         lens, given = looked_at(self.rms, fields, wavelengths, object_distance, aperture)
         distance = given.object_distance
@@ -135,7 +135,7 @@ class OverFieldViews:
         """
         from dolens.analysis.conditions import field_scans
         from dolens.diffraction.illumination import relative_illumination
-        from dolens.plotting.illumination import illumination_figure
+        from dolens.plotting.field_curves import illumination_figure
 
         wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(

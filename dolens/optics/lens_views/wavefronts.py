@@ -90,8 +90,8 @@ class WavefrontViews:
             aperture: see the class.
         """
         from dolens.analysis.conditions import field_scans
-        from dolens.diffraction.strehl import strehl_ratios
-        from dolens.plotting.strehl import strehl_figure
+        from dolens.diffraction.point_spread import strehl_ratios
+        from dolens.plotting.wavefront_maps import strehl_figure
 
         waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
         lens, given = looked_at(self.strehl, 0.0, waves, object_distance, aperture)

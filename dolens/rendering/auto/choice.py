@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 import torch
 
 from dolens.errors import InputError
-from dolens.rendering.auto.agreement import Agreement, from_plain, plain
 from dolens.rendering.auto.field_grid import Decision
 from dolens.rendering.auto.trial import Trial
+from dolens.rendering.gradient_check import Agreement, from_plain, plain
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer

@@ -1,18 +1,142 @@
-"""The grid of point spread functions that a sensor needs, and their centres."""
+"""The grid of point spread functions that a sensor needs, found from ones that are sampled finely
+all over it, and rough costs of renders.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
+from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
-from dolens.rendering.auto.costs import psf_cost
+from dolens.optics.backend import cpu_kernels_serve
 from dolens.rendering.auto.probes import MEAN, grey_levels
-from dolens.rendering.auto.survey import Survey, survey
+from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.patches import node_positions, triangle_weights
+from dolens.rendering.patch_convolution import node_positions, transform_length, triangle_weights
+from dolens.rendering.plane_points import (
+    PlanePoints,
+    chief_ray_points,
+    pinhole_points,
+    plane_points,
+)
+from dolens.rendering.psf_grid import (
+    sampled_disc,
+    splat_plane_points,
+    wave_cost,
+    wave_point_spread_functions,
+)
 from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.relative_illumination import RADII, RAYS
+from dolens.scene.scene import Scene
+from dolens.sensor.pixels import Sensor
+
+# The plastic number's sequence fills a square evenly (Roberts, 2018).
+_FIRST, _SECOND = 0.7548776662466927, 0.5698402909980532
+
+Pixels = tuple[Tensor, Tensor]  # fractional rows and columns, each (N,)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Rays of N points of a sensor, on D planes of a scene at C wavelengths.
+
+    Attributes:
+        imaging: the lens, the scene, the sensor and the pupil.
+        pixels: fractional rows and columns of the points.
+        seen: their rays.
+        chief: rows and columns of the chief rays, each (N, D, C); None where some do not pass.
+        pinhole: rows and columns as a pinhole sees the points.
+    """
+
+    imaging: ImagingSystem
+    pixels: Pixels
+    seen: PlanePoints
+    chief: tuple[Tensor, Tensor] | None
+    pinhole: tuple[Tensor, Tensor]
+
+    @property
+    def f_number(self) -> float:
+        """The F-number that the axial beam works with."""
+        return working_f_number(self.imaging.pupil, float(self.imaging.system.vertices[-1]))
+
+    @property
+    def points(self) -> tuple[Tensor, Tensor]:
+        """x and y of the points on the sensor, mm."""
+        return self.imaging.sensor.positions(*self.pixels)
+
+    def centres(self, distortion: bool) -> tuple[Tensor, Tensor]:
+        """The points that functions are centred on: the chief rays', or a pinhole's."""
+        if not distortion:
+            return self.pinhole
+        assert self.chief is not None  # no plan is made of those that do not pass
+        return self.chief
+
+    def offsets(self, distortion: bool) -> PlanePoints:
+        """Rays by their distance from the centres."""
+        rows, columns = (c[..., None].to(self.seen.rows) for c in self.centres(distortion))
+        return PlanePoints(self.seen.rows - rows, self.seen.columns - columns, self.seen.weight)
+
+    def functions(self, size: int, distortion: bool) -> Tensor:
+        """(N, D, C, size, size)."""
+        fused = cpu_kernels_serve(self.imaging.system)
+        return splat_plane_points(self.offsets(distortion), size, fused).functions
+
+    def waves(self, size: int, distortion: bool) -> Tensor:
+        """Functions (N, D, C, size, size) with diffraction, of the same points."""
+        # Near enough for a plan; direct integration would take minutes.
+        settings = DiffractionSettings(method="fourier")
+        found = wave_point_spread_functions(self.imaging, self.points, size, distortion, settings)
+        return found.functions
+
+    def wave_cost(self, size: int, distortion: bool) -> tuple[int, str | None]:
+        """Samples along a pupil, and why Fourier transforms do not do, as `psf_grid.wave_cost`."""
+        return wave_cost(self.imaging, self.points, size, distortion)
+
+    def light(self) -> Tensor:
+        """(N, 1, C), relative illumination."""
+        return self.seen.weight.sum(-1)
+
+
+@torch.no_grad()
+def survey(imaging: ImagingSystem, pixels: Pixels, pupil_samples: int, seed: int = 0) -> Survey:
+    """Trace rays from points of a sensor to the planes of a scene.
+
+    All points share their places in the pupil, so that functions of neighbours are alike in what
+    the sampling leaves.
+
+    Args:
+        imaging: the lens, the scene, the sensor and the pupil, numbers.
+        pixels: fractional rows and columns of the points.
+        pupil_samples: strata along each side of the pupil.
+        seed: of the points in the strata.
+    """
+    points = imaging.sensor.positions(*pixels)
+    disc = sampled_disc(torch.zeros(1, dtype=torch.int64), pupil_samples, seed, imaging.system)
+    return Survey(
+        imaging,
+        pixels,
+        plane_points(imaging, points, disc),
+        _chief(imaging, points),
+        pinhole_points(imaging, points),
+    )
+
+
+def _chief(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor] | None:
+    try:
+        return chief_ray_points(imaging, points)
+    except InputError:
+        return None
+
+
+def spread_pixels(sensor: Sensor, count: int) -> Pixels:
+    """Rows and columns of `count` points that fill a sensor evenly, each (count,)."""
+    index = torch.arange(1, count + 1, dtype=torch.float64)
+    down, across = (0.5 + index * _FIRST).frac(), (0.5 + index * _SECOND).frac()
+    return down * (sensor.height - 1), across * (sensor.width - 1)
+
 
 # Strata of the pupil along each side, for functions that are compared.
 SAMPLES = 48
@@ -185,3 +309,41 @@ def _interpolation_error(renderer: PsfRenderer, truth: Survey, nodes: Survey) ->
     if renderer.illumination == "map":
         found = found * truth.light()[..., None, None]
     return float(grey_levels(found - wanted).square().mean().sqrt())
+
+
+# Nanoseconds: a ray and surface, forward and back; a ray's lookup of a texel, forward and back; a
+# point of a transform, over the logarithm of their number; a pixel's lookup between pixels; a ray's
+# splat; a ray and surface of the illumination's map; what a render, and each of its nodes, takes
+# whatever its size.  From the times of experiment=speed_vs_error.
+_SURFACE, _TEXEL, _TRANSFORM, _LOOKUP, _SPLAT = 5.5, 7.0, 0.6, 35.0, 30.0
+_MAPPED, _RENDER, _NODE = 12.0, 4e6, 1e6
+_TRANSFORMS = 6  # of texture, kernel and image, forward and back
+
+
+def rays_cost(sensor: Sensor, samples: int, scene: Scene, surfaces: int, images: int = 1) -> float:
+    """Nanoseconds of a render by `samples` rays a pixel and colour."""
+    rays = sensor.height * sensor.width * samples * len(scene.wavelengths)
+    return rays * (surfaces * _SURFACE + len(scene.depths) * images * _TEXEL)
+
+
+def psf_cost(renderer: PsfRenderer, scene: Scene, surfaces: int, images: int = 1) -> float:
+    """Nanoseconds of a render by point spread functions."""
+    sensor, depths, channels = renderer.sensor, len(scene.depths), len(scene.wavelengths)
+    nodes = renderer.fields[0] * renderer.fields[1]
+    sides = [
+        transform_length(
+            math.ceil(length if count == 1 else min(length, 2 * length / (count - 1)))
+            + renderer.size
+        )
+        for length, count in zip((sensor.height, sensor.width), renderer.fields, strict=True)
+    ]
+    points = sides[0] * sides[1]
+    transforms = nodes * _TRANSFORMS * channels * depths * images
+    cost = _RENDER + nodes * _NODE + transforms * points * math.log2(points) * _TRANSFORM
+    cost += renderer.rays_per_image(scene) * (surfaces * _SURFACE + depths * _SPLAT)
+    pixels = sensor.height * sensor.width * channels
+    if renderer.registration == "chief_rays":
+        cost += pixels * 4 * depths * images * _LOOKUP
+    if renderer.illumination == "map":
+        cost += RADII * RAYS * channels * surfaces * _MAPPED + pixels * _LOOKUP
+    return cost

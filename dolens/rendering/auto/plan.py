@@ -8,17 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
+from dolens.diffraction.pixel_psf import diffraction_transfer, with_diffraction_limit
 from dolens.rendering.auto.field_grid import (
     REGISTRATIONS,
     SAMPLES,
     WINDOW_SHARE,
     Decision,
+    Pixels,
+    Survey,
     choose_fields,
+    spread_pixels,
+    survey,
     window_decision,
 )
 from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
-from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.scene import Scene

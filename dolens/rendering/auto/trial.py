@@ -8,7 +8,12 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
-from dolens.rendering.auto.agreement import (
+from dolens.rendering.auto.field_grid import psf_cost, rays_cost
+from dolens.rendering.auto.plan import Plan, Requirements, plan, union
+from dolens.rendering.auto.probes import Reference, probe_texture, rays_samples, reference
+from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.exit_pupil import paraxial_exit_pupil
+from dolens.rendering.gradient_check import (
     Agreement,
     Render,
     agreement,
@@ -17,14 +22,9 @@ from dolens.rendering.auto.agreement import (
     image_measure,
     reference_strata,
 )
-from dolens.rendering.auto.costs import psf_cost, rays_cost
-from dolens.rendering.auto.plan import Plan, Requirements, plan, union
-from dolens.rendering.auto.probes import Reference, probe_texture, rays_samples, reference
-from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, as_planes, pinhole_image
 from dolens.scene.scene import Scene

@@ -12,8 +12,8 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.experiments.camera.views.whole import ByPlace, Placing, WholePicture
 from dolens.optics.lens import Lens
+from dolens.rendering.exit_pupil import axial_f_number
 from dolens.rendering.protocol import Measure, Renderer
-from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.scene import Scene
 from dolens.sensor.noise import BatchShare, generator_of
 from dolens.sensor.pixels import Sensor

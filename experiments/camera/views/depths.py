@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
-from dolens.diffraction.diffraction_limit import with_diffraction_limit
+from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from dolens.experiments.camera.views.truth import (
@@ -25,10 +25,10 @@ from dolens.experiments.camera.views.whole import (
 )
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.exit_pupil import axial_f_number
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene, resized
 from dolens.sensor.colour import linear_to_srgb

@@ -9,7 +9,7 @@ from dolens.experiments.camera.views.truth import CENTROIDS, light_imaging, refe
 from dolens.optics.backend import say_once, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.place_functions import (
+from dolens.rendering.psf_grid import (
     IdealPlaces,
     PlaceFunctions,
     chief_ray_places,

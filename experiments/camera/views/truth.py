@@ -9,12 +9,12 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.chief_ray_map import chief_ray_maps
-from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.differentiable_pupil import (
+from dolens.rendering.differentiable_geometry import (
     differentiable_chief_pupil,
     differentiable_exit_pupil,
 )
-from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
+from dolens.rendering.exit_pupil import paraxial_exit_pupil
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.scene.planar import as_planes
 from dolens.scene.scene import Scene, bilinear, texture_origin
 from dolens.sensor.pixels import Sensor

@@ -8,7 +8,7 @@ from dolens.experiments.report.checks import SOURCES, Check, Outcome, State
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import limit_text, number_text, value_text
 from dolens.html import Child, Markup, element, joined, prose, table
-from dolens.plotting.number_text import with_minus
+from dolens.plotting.style import with_minus
 
 _ORDER = (State.FAILS, State.NOT_RUN, State.HOLDS)
 _TITLES = {

@@ -1,4 +1,4 @@
-"""Counters give random numbers, the same bits as `dolens.rendering.random_numbers`."""
+"""Counters give random numbers, the same bits as `dolens.rendering.sampling`."""
 
 from numba import njit, types
 

@@ -1,0 +1,351 @@
+"""Point spread functions with diffraction, as pixels collect them; differentiable in the lens.
+
+The blur of a perfect lens's finite aperture, put behind geometric point spread functions.
+
+The product of the geometric transfer function and the perfect pupil's is right in both limits, of
+rays that all meet in a point and of aberrations of many wavelengths.  In between it errs; how much,
+a wave calculation tells.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.propagation import (
+    DiffractionSettings,
+    Propagation,
+    choose_propagation,
+    direct_field,
+    direct_samples,
+    fourier_field,
+    fourier_samples,
+    subsamples,
+)
+from dolens.diffraction.pupil_fit import (
+    PupilFit,
+    RegularPupil,
+    fit_pupil,
+    regular_pupil,
+    with_differentiable_bounds,
+)
+from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.backend import say_once
+from dolens.optics.replay import replay
+from dolens.optics.system import OpticalSystem
+
+
+@dataclass(frozen=True)
+class PixelWindow:
+    """A square window of pixels about a point of the sensor.
+
+    Attributes:
+        pitch: of the pixels, mm.
+        size: pixels along each side.
+
+    Raises:
+        InputError: a pitch that is not positive, or no pixel.
+    """
+
+    pitch: float
+    size: int
+
+    def __post_init__(self) -> None:
+        if not self.pitch > 0.0 or self.size < 1:
+            raise InputError(
+                f"pitch must be positive and size at least 1, not {self.pitch} and {self.size}"
+            )
+
+    @property
+    def half_width(self) -> float:
+        """mm, of what `fine_grid` covers."""
+        return self.pitch * (0.5 * self.size + 1.0)
+
+
+def quadratic_b_spline(u: Tensor) -> Tensor:
+    """β(u): a unit box convolved with itself twice; 3/4 - u² near zero, zero from |u| = 3/2 on."""
+    u = u.abs()
+    return torch.where(u < 0.5, 0.75 - u * u, 0.5 * (1.5 - u).clamp(min=0.0).square())
+
+
+def fine_grid(size: int, subsamples: int, like: Tensor) -> Tensor:
+    """Return the samples along a window of pixels: centres of cells, in pixels from its middle.
+
+    Args:
+        size: pixels along a side.
+        subsamples: cells a pixel.
+        like: gives precision and device.
+
+    Returns:
+        (subsamples·(size + 2),), ascending; β reaches a pixel beyond the window.
+    """
+    count = subsamples * (size + 2)
+    cells = torch.arange(count, dtype=like.dtype, device=like.device)
+    return (cells + 0.5) / subsamples - 0.5 * (size + 2)
+
+
+def pixel_matrix(size: int, subsamples: int, like: Tensor) -> Tensor:
+    """β(x/p - i) of every pixel i at the samples x of `fine_grid`.
+
+    β is a pixel's box convolved with a texel's tent, as in `dolens.rendering.psf`.  With B this
+    matrix times the samples' distance, B·I·Bᵀ is what pixels collect of the irradiance I: exactly,
+    where I has no frequency that a multiple of the samples' own takes to where β has one.
+
+    Args:
+        size: pixels along a side.
+        subsamples: samples a pixel.
+        like: gives precision and device.
+
+    Returns:
+        (size, subsamples·(size + 2)).  The pixels' shares of a sample add up to one within the
+        window.
+    """
+    pixel = torch.arange(size, dtype=like.dtype, device=like.device) - 0.5 * (size - 1)
+    return quadratic_b_spline(fine_grid(size, subsamples, like) - pixel[:, None])
+
+
+Points = ObjectPoints | Tensor | Sequence[Sequence[float]]
+Centres = Tensor | Sequence[Sequence[float]] | None
+Wavelengths = float | Sequence[float] | Tensor
+
+# Degrees of the fit that are tried, and the share of the phase error that the first may leave.
+_DEGREES, _SHARE = (10, 16), 0.01
+# Numbers of a piece of work; more pupils than fit are done in pieces, and again for the gradient.
+_PIECE = 1 << 24
+# Functions that are evaluated for a pupil: path difference, amplitude, what passes, and crossings.
+_FUNCTIONS = 8
+
+
+def wave_kernels(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    window: PixelWindow,
+    settings: DiffractionSettings | None = None,
+) -> Tensor:
+    """Compute what pixels collect of object points' light, with diffraction.
+
+    Each kernel is the irradiance convolved with a quadratic B-spline, a pixel's box by a texel's
+    tent, as in `axial_point_spread_functions`: the discrete convolution of a texture with it is the
+    image, wherever the field is small enough for one kernel.
+
+    Where the Fourier transform does not hold, the integral is done directly, which takes a thousand
+    times as long; the log says so and why, and so does `propagation`.
+
+    Args:
+        system: `lens.system(values)`.
+        points: N object points, or their positions (N, 3) in mm in the lens's axes (z < 0).
+        wavelength: nm, one or N.
+        centres: (N, 2), mm on the sensor, of the windows; None: where the chief rays land.
+        window: its pitch and size are those of all windows.
+        settings: how finely; None: the default.
+
+    Returns:
+        (N, size, size), in the lens's precision, upright as in `Sensor`: the point (x, y) from the
+        centre is at column (size - 1)/2 - x/pitch and row (size - 1)/2 + y/pitch.  The sum over an
+        infinite window is the flux that passes, over that of the axial point of the same object
+        plane through the paraxial entrance pupil; zero where none passes.  Differentiable in the
+        lens, the movement of the pupil's edges included; windows are held constant.
+
+    Raises:
+        InputError: numbers that do not fit, or a wavefront too steep for diffraction.
+    """
+    settings = settings or DiffractionSettings()
+    found = _prepare(system, points, wavelength, centres, window, settings)
+    cells = settings.subsamples or subsamples(found.fit, window.pitch)
+    pixels = _Subpixels(window, cells, system.dtype)
+    fourier = found.chosen.fourier
+    if settings.method != "auto":
+        fourier = torch.full_like(fourier, settings.method == "fourier")
+    if bool(fourier.all()):
+        return _by_fourier(found, pixels)
+    which = torch.nonzero(~fourier).flatten()
+    if settings.method == "auto":
+        for n in which.tolist():
+            say_once(f"diffraction: {found.chosen.reasons[n]}")
+    front = found.fit.wavefront
+    rays = pupil_wavefront(
+        system,
+        found.points[which],
+        front.wavelength[which],
+        front.centre[which],
+        direct_samples(front, window.half_width, settings),
+        1.0 / front.curvature[which],
+    )
+    direct = _by_integration(rays, pixels)
+    if len(which) == len(found.points):
+        return direct
+    return _by_fourier(found, pixels).index_copy(0, which, direct)
+
+
+@torch.no_grad()
+def propagation(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    window: PixelWindow,
+    settings: DiffractionSettings | None = None,
+) -> Propagation:
+    """Say how `wave_kernels` of the same arguments propagates light by itself, and why."""
+    settings = settings or DiffractionSettings()
+    return _prepare(system, points, wavelength, centres, window, settings).chosen
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    points: ObjectPoints
+    fit: PupilFit
+    samples: int
+    chosen: Propagation
+    # Of all pupils, where they are one piece of work.
+    pupil: RegularPupil | None = None
+
+    def pieces(self, beside: int) -> Sequence[Tensor]:
+        """Numbers of the pupils, as many at a time as memory is meant for, beside a window."""
+        return _pieces(self.fit, self.samples, beside)
+
+
+def _pieces(fit: PupilFit, samples: int, beside: int = 0) -> Sequence[Tensor]:
+    size = _FUNCTIONS * samples**2 + (samples + beside) ** 2
+    return torch.arange(len(fit.low)).split(max(1, _PIECE // size))
+
+
+@dataclass(frozen=True)
+class _Subpixels:
+    window: PixelWindow
+    count: int
+    dtype: torch.dtype
+
+    def grid(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """x and y (mm) of the irradiance's columns and rows, ordered as pixels are stored."""
+        fine = self.window.pitch * fine_grid(self.window.size, self.count, like)
+        return -fine, fine
+
+    def integrated(self, field: Tensor) -> Tensor:
+        """(N, size, size): the flux of |field|² in every pixel."""
+        irradiance = field.real.square() + field.imag.square()
+        step = self.window.pitch / self.count
+        matrix = step * pixel_matrix(self.window.size, self.count, irradiance)
+        return matrix @ irradiance @ matrix.mT
+
+
+def _prepare(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    window: PixelWindow,
+    settings: DiffractionSettings,
+) -> _Prepared:
+    if not isinstance(points, ObjectPoints):
+        points = ObjectPoints.at(points)
+    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
+    fit = with_differentiable_bounds(_fitted(rays, settings))
+    points = points.to(rays.opd.dtype, rays.opd.device)
+    samples = fourier_samples(fit, window.half_width, settings)
+    parts = _pieces(fit, samples)
+    pupil = regular_pupil(fit, samples) if len(parts) == 1 else None
+    if pupil is not None:
+        flux = pupil.flux
+    else:
+        with torch.no_grad():
+            flux = torch.cat([regular_pupil(fit, samples, part).flux for part in parts])
+    chosen = choose_propagation(fit, flux, window.half_width, settings)
+    return _Prepared(points, fit, samples, replace(chosen, samples=samples), pupil)
+
+
+def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
+    if settings.degree is not None:
+        return fit_pupil(wavefront, settings.degree)
+    fit = fit_pupil(wavefront, _DEGREES[0])
+    if bool((fit.residual <= _SHARE * settings.phase_error).all()):
+        return fit
+    return fit_pupil(wavefront, _DEGREES[1])
+
+
+def _by_fourier(found: _Prepared, pixels: _Subpixels) -> Tensor:
+    x, y = pixels.grid(found.fit.low)
+    parts = found.pieces(len(x))
+
+    def kernels(pupil: RegularPupil) -> Tensor:
+        return pixels.integrated(fourier_field(pupil, x, y, pixels.dtype))
+
+    if found.pupil is not None and len(parts) == 1:
+        return kernels(found.pupil)
+
+    clipping = found.fit.wavefront.clipping
+    moving = {n: surface.edge for n, surface in clipping.items() if surface.edge is not None}
+
+    def piece(i: int, coefficients: Tensor, low: Tensor, high: Tensor, *edges: Tensor) -> Tensor:
+        moved = {n: replace(clipping[n], edge=e) for n, e in zip(moving, edges, strict=True)}
+        wavefront = replace(found.fit.wavefront, clipping={**clipping, **moved})
+        fit = replace(found.fit, coefficients=coefficients, low=low, high=high, wavefront=wavefront)
+        return kernels(regular_pupil(fit, found.samples, parts[i])).movedim(0, -1)
+
+    fit = found.fit
+    tensors = (fit.coefficients, fit.low, fit.high, *moving.values())
+    return replay(piece, [len(part) for part in parts], tensors).movedim(-1, 0)
+
+
+def _by_integration(wavefront: Wavefront, pixels: _Subpixels) -> Tensor:
+    x, y = pixels.grid(wavefront.opd)
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    field = direct_field(wavefront, columns.flatten(), rows.flatten(), pixels.dtype)
+    return pixels.integrated(field.unflatten(-1, (len(y), len(x))))
+
+
+def diffraction_transfer(
+    height: int, width: int, pitch: float, wavelength: float, f_number: float | Tensor
+) -> Tensor:
+    """The incoherent transfer function of a perfect, round pupil.
+
+    (2/π)·(arccos s - s·√(1 - s²)), with s the frequency over 1/(λN), and zero beyond it (Goodman,
+    Introduction to Fourier Optics).
+
+    Args:
+        height: of the transform.
+        width: of the transform.
+        pitch: of the pixels, mm.
+        wavelength: nm.
+        f_number: N, that the light works with: 1/(2·sin u').
+
+    Returns:
+        (height, width/2 + 1), float64, at the frequencies of `rfft2`; differentiable in N once.
+    """
+    device = f_number.device if isinstance(f_number, Tensor) else torch.device("cpu")
+    down = torch.fft.fftfreq(height, dtype=torch.float64, device=device)
+    across = torch.fft.rfftfreq(width, dtype=torch.float64, device=device)
+    cutoff = pitch / (wavelength * 1e-6 * f_number)
+    moved = torch.hypot(down[:, None], across[None]) / cutoff
+    s = moved.detach().clamp(max=1.0)
+    root = (1.0 - s * s).sqrt()
+    found = (torch.arccos(s) - s * root) * (2.0 / math.pi)
+    # The slope, -(4/π)·√(1 - s²), is zero at the cutoff, where arccos's own is infinite.
+    return found - (4.0 / math.pi) * root * (moved - moved.detach())
+
+
+def with_diffraction_limit(
+    functions: Tensor, pitch: float, wavelengths: Sequence[float], f_number: float | Tensor
+) -> Tensor:
+    """Functions (..., C, K, K) blurred by the perfect pupil's diffraction at C wavelengths.
+
+    What this spreads beyond the window, 2λN/(π²r) of the light beyond radius r, is given back in
+    proportion, so that each function keeps its sum.
+    """
+    size = functions.shape[-1]
+    # As wide as the Airy disc's share beyond it is small, lest its other side come back in.
+    side = max(2 * size, 128)
+    transfer = torch.stack(
+        [diffraction_transfer(side, side, pitch, w, f_number) for w in wavelengths]
+    ).to(functions)
+    spectrum = torch.fft.rfft2(functions, s=(side, side)) * transfer
+    blurred = torch.fft.irfft2(spectrum, s=(side, side))[..., :size, :size]
+    kept = blurred.sum((-2, -1), keepdim=True)
+    total = functions.sum((-2, -1), keepdim=True)
+    return blurred * torch.where(kept > 0.0, total / torch.where(kept > 0.0, kept, 1.0), 0.0)
