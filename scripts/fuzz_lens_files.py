@@ -19,7 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens import InputError, Rays, load_lens
-from dolens.optics.glass_folders import glass_folders, user_entries
+from dolens.optics.glass_catalog import glass_folders, user_entries
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.files import (
     encode_prescription,

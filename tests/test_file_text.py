@@ -13,8 +13,7 @@ from dolens.experiments.camera_search.forms import forms_of_run
 from dolens.experiments.data.package_photographs import read_manifest
 from dolens.files import read_file
 from dolens.lens_page.offenders import _read as read_tolerances
-from dolens.optics.glass_catalog import find_glass
-from dolens.optics.glass_folders import glass_folders
+from dolens.optics.glass_catalog import find_glass, glass_folders
 from dolens.prescriptions.check_files import check_file
 
 UNREADABLE = {

@@ -14,11 +14,11 @@ from torch import Tensor
 from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, Chart, OnSensor, WeightedSums, on_sensor
 from dolens.alignment.gaussian_filters import smoothed_weights
 from dolens.errors import InputError
+from dolens.optics.autograd import forward_columns
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
-from dolens.optics.row_jacobian import forward_columns
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 

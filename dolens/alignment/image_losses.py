@@ -12,7 +12,7 @@ from dolens.alignment.gaussian_filters import blurred, noise_left
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
-from dolens.optics.row_jacobian import forward_columns
+from dolens.optics.autograd import forward_columns
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.rendering.spot_image import SpotImager
 

@@ -12,7 +12,7 @@ from dolens.alignment.gaussian_filters import blurred
 from dolens.alignment.image_losses import deviation, exposure_of, spill_left
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.optics.row_jacobian import forward_columns
+from dolens.optics.autograd import forward_columns
 from dolens.rendering.spot_image import SpotImager
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import to_lens_units
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.parameter_names import to_lens_units
+from dolens.optics.system import require_plane_sensor
 from dolens.optimize.variables import DesignVariables
 from dolens.rendering.spot_image import SpotImage, SpotImager
 

@@ -20,12 +20,17 @@ from dolens.alignment.moments import (
 )
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
-from dolens.optics.backend import choose_backend
-from dolens.optics.family_parts import intercept_parts, jacobian_parts
 from dolens.optics.lens import Lens
-from dolens.optics.lens_family import FamilyRays, LensFamily, shared_rays
+from dolens.optics.lens_family import (
+    FamilyRays,
+    LensFamily,
+    intercept_parts,
+    jacobian_parts,
+    shared_rays,
+)
+from dolens.optics.ray_tracing import choose_backend
 from dolens.optics.rays import Components, Rays
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.optics.trace import trace_surfaces, trace_to_sensor
 from dolens.optimize.image_quality import without_edges
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.errors import InputError
+from dolens.optics.aiming import field_line, launch
 from dolens.optics.fields import require_from_the_front
-from dolens.optics.launching import field_line, launch
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Rays, Status
@@ -34,7 +34,7 @@ class ParabasalRays:
         position: (F, W, 2), mm, of the chief rays on the sensor.
         slope: (F, W, 2), dx/dz and dy/dz behind the last surface.
         position_rate: (F, W, 2, 2), ∂position/∂q, with q (mm) across the beam in the plane
-            through the first vertex that faces the field (see `dolens.optics.launching`).  Of a
+            through the first vertex that faces the field (see `dolens.optics.aiming`).  Of a
             curved sensor on the plane z = const. through the chief ray's point.
         slope_rate: (F, W, 2, 2), ∂slope/∂q, 1/mm.
         image_rate: (F, W, 2, 2), mm, ∂position/∂(tan x, tan y) for an object at infinity, else

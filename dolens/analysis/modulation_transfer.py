@@ -22,7 +22,7 @@ from dolens.analysis.ray_intercepts import (
 )
 from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
 from dolens.errors import InputError
-from dolens.optics.launching import field_line
+from dolens.optics.aiming import field_line
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 

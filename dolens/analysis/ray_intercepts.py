@@ -16,10 +16,9 @@ from torch import Tensor
 
 from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
 from dolens.errors import InputError
-from dolens.optics.aiming import AimedRays
+from dolens.optics.aiming import AimedRays, field_line, launch
 from dolens.optics.fields import vignetting_margin
 from dolens.optics.image_surface import TangentPlanes
-from dolens.optics.launching import field_line, launch
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays

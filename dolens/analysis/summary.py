@@ -19,7 +19,7 @@ from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.optics.fields import point_text, weights_text
 from dolens.optics.lens import Lens
-from dolens.optics.tables import html_table, printable, text_table
+from dolens.optics.text_tables import html_table, printable, text_table
 
 _RAYS = 2000
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.jacobi import jacobi
-from dolens.optics.surfaces.zernike_terms import FRINGE_TERMS, ZernikeTerm, fringe, noll
+from dolens.optics.surfaces.zernike import FRINGE_TERMS, ZernikeTerm, fringe, jacobi, noll
 
 ORDERS = {"fringe": fringe, "standard": noll}
 # Terms that are fitted unless another number is asked for: all of the fringe order.

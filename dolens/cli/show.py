@@ -77,7 +77,7 @@ def show(
     from dolens.errors import InputError
     from dolens.files import check_written
     from dolens.lens_page.overview import lens_overview, prepared_lens
-    from dolens.optics.tables import printable
+    from dolens.optics.text_tables import printable
     from dolens.prescriptions import lens_from_prescription
     from dolens.prescriptions.files import find_lens, read_lens_file, read_yaml_file
 
@@ -151,7 +151,7 @@ def _check_page(page: Path, lens: Path, force: bool) -> None:
 
 def _print_table(console: "Console", table: "Table") -> None:
     """Print a table; one wider than the terminal goes on below, each part with its first column."""
-    from dolens.optics.tables import printable
+    from dolens.optics.text_tables import printable
 
     def least(columns: list[int]) -> int:
         wide = console.options.update(max_width=1000)
@@ -180,7 +180,7 @@ def _rich_table(table: "Table", columns: list[int]) -> "RichTable":
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    from dolens.optics.tables import printable
+    from dolens.optics.text_tables import printable
 
     shown = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1))
     for column in columns:

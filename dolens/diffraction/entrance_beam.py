@@ -7,7 +7,7 @@ them falls off as cos⁴ of the field angle where nothing clips the light and th
 not change.
 
 A ray of a given object point is fixed by where it crosses the plane through the first vertex that
-faces the point (see `dolens.optics.launching`).  Tracing costs so little that the part of this
+faces the point (see `dolens.optics.aiming`).  Tracing costs so little that the part of this
 plane whose rays pass is found by trying all that meet the first surface: unlike aiming at the stop,
 this asks nothing of the pupil's shape and place.
 """
@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.aiming import launch, line_of_slopes
 from dolens.optics.elements import to_lens_axes
-from dolens.optics.launching import launch, line_of_slopes
 from dolens.optics.paraxial import entrance_pupil, matrix_to_stop
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays

@@ -34,8 +34,8 @@ from dolens.diffraction.pupil_fit import (
 )
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
 from dolens.errors import InputError
-from dolens.optics.backend import say_once
-from dolens.optics.replay import replay
+from dolens.optics.autograd import replay
+from dolens.optics.ray_tracing import say_once
 from dolens.optics.system import OpticalSystem
 
 

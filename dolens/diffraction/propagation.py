@@ -22,7 +22,7 @@ from dolens.diffraction.pupil_fit import PupilFit, RegularPupil
 from dolens.diffraction.reference_sphere import path_beyond
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront
 from dolens.errors import InputError
-from dolens.optics.replay import replay
+from dolens.optics.autograd import replay
 
 METHODS = ("auto", "fourier", "direct")
 # Fewest samples across a pupil, so that its edge is where it belongs, and most.

@@ -28,12 +28,12 @@ from dolens.diffraction.reference_sphere import (
 )
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes
+from dolens.optics.paraxial_rays import with_vergences
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
-from dolens.optics.vergence import with_vergences
 
 # Smallest slope along one axis of a grid over that along the other: an edge along the grid.
 _ALONG = 1e-3

@@ -2,23 +2,58 @@
 
 `dolens::trace` and `dolens::trace_adjoint` take a packed table as tensors, so that graphs and saved
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
+
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from dolens.errors import InputError
-from dolens.kernels.registration import (
-    forbid_derivative,
-    operator,
-    register_derivative,
-    register_shapes,
-)
 from dolens.kernels.table import SurfaceTable
+
+_library = torch.library.Library("dolens", "DEF")
+
+
+def operator(function: Callable[..., Any]) -> Any:
+    """Make a function of tensors the operator `dolens::<its name>`.
+
+    `torch.library.custom_op` does the same, but imports PyTorch's whole compiler with the first
+    call (seconds), and makes every call 20 to 50 µs longer.
+    """
+    schema = torch.library.infer_schema(function, mutates_args=())
+    name = function.__name__
+    _library.define(name + schema, tags=(torch.Tag.pt2_compliant_tag,))
+    _library.impl(name, function, "CompositeExplicitAutograd")
+    return getattr(torch.ops.dolens, name).default
+
+
+def register_shapes(name: str, shapes: Callable[..., Any]) -> None:
+    """Give an operator the function that makes empty tensors of its results' shapes."""
+    torch.library.register_fake(f"dolens::{name}", shapes, lib=_library)
+
+
+def register_derivative(
+    name: str, backward: Callable[..., Any], setup: Callable[..., None]
+) -> None:
+    """Give an operator its backward pass, and the function that saves tensors for it."""
+    torch.library.register_autograd(f"dolens::{name}", backward, setup_context=setup, lib=_library)
+
+
+def forbid_derivative(name: str) -> None:
+    """Make the derivative of an adjoint, a second derivative, an error that says so."""
+
+    def backward(ctx: Any, *gradients: Any) -> None:
+        raise InputError(
+            "the fast kernels give first derivatives only; use backend 'reference' for second"
+        )
+
+    register_derivative(name, backward, lambda ctx, inputs, output: None)
 
 
 def kernels_of(position: Tensor) -> Any:
@@ -157,3 +192,29 @@ register_shapes("trace", _trace_shapes)
 register_derivative("trace", _backward, _setup)
 register_shapes("trace_adjoint", _trace_adjoint_shapes)
 forbid_derivative("trace_adjoint")
+
+
+_PLAIN = frozenset((Tensor, nn.Parameter))
+
+
+def is_eager(tensors: Iterable[Tensor]) -> bool:
+    """Return whether operations on these tensors run at once, and for autograd at most.
+
+    Otherwise a compiler, a tracer, a mode, a transform of torch.func, a batch of gradients or a
+    subclass of tensors looks on, and must see operators.
+    """
+    return are_plain(tuple(tensors)) and not (
+        torch.compiler.is_compiling()
+        or torch._C._is_tracing()
+        or torch._C._len_torch_dispatch_stack()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+    )
+
+
+def are_plain(tensors: Sequence[Tensor]) -> bool:
+    """Return whether these are tensors and parameters of PyTorch's, and no batches of gradients."""
+    kinds = {*map(type, tensors)}
+    if not kinds <= _PLAIN:
+        return False
+    return Tensor not in kinds or not any(map(torch._C._functorch.is_legacy_batchedtensor, tensors))

@@ -1,7 +1,8 @@
-"""A surface names the modules of its kernels, which are imported when a lens first needs them.
+"""Surfaces and laws of deflection name the modules of their kernels, imported when first needed.
 
-A surface class carries a `SurfaceKernel`.  Its `code` marks the surface's steps in a table, so that
-the kernels know no list of surfaces: a new one is its own modules.
+A surface class carries a `SurfaceKernel`, and a law a `LawKernel`.  Its `code` marks its steps in a
+table, so that the kernels know no list of surfaces: a new one is its own modules.
+
 """
 
 from dataclasses import dataclass, field
@@ -71,3 +72,34 @@ def kernels_of(code: int, device: str) -> Any:
     if not hasattr(module, "KERNELS"):
         raise InputError(f"a surface's {device} kernels: module '{name}' offers no KERNELS")
     return module.KERNELS
+
+
+_law_codes = count(1)
+_law_by_code: dict[int, "LawKernel"] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class LawKernel:
+    """A law has kernels for the CPU and for GPUs.
+
+    Args:
+        cpu: the name of a module with `LawFunctions` of Numba as `KERNELS`.
+        cuda: the name of one with `LawFunctions` of Triton.
+
+    Attributes:
+        code: what marks this law's steps in a table; it is given anew in each process.
+    """
+
+    cpu: str
+    cuda: str
+    code: int = field(init=False, default_factory=lambda: next(_law_codes))
+
+    def __post_init__(self) -> None:
+        _law_by_code[self.code] = self
+
+
+@cache
+def law_kernels_of(code: int, device: str) -> Any:
+    """Return `KERNELS` of a law's module for `cpu` or `cuda`, imported when first needed."""
+    kernel = _law_by_code[code]
+    return import_module({"cpu": kernel.cpu, "cuda": kernel.cuda}[device]).KERNELS

@@ -20,11 +20,10 @@ from dolens.lens_page.tables import (
     seidel_table,
     spot_radii_table,
 )
-from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.fields import Fields, field_label, weights_text
-from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import to_file_units
-from dolens.optics.published import Published
+from dolens.optics.lens import Lens, Published
+from dolens.optics.parameter_names import to_file_units
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.
 _RAYS = 2000

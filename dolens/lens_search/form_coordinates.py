@@ -27,7 +27,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.optics.surfaces.state import SurfaceState
 
 # Surfaces of a smaller slope at the beam's edge are planes.

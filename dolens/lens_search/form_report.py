@@ -23,7 +23,7 @@ from dolens.lens_search.verification import Requirements, Verification, verify
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.plotting.small_sections import SmallSection, form_section
 from dolens.plotting.tolerances import parameter_label
 from dolens.prescriptions.build import prescription_of

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import STOP, Arrangement
-from dolens.optics.paraxial_recurrence import UNIT_RAYS, Number, TwoRays
+from dolens.optics.paraxial import UNIT_RAYS, Number, TwoRays
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from dolens.manufacturing.glass_elements import GlassElement, face_of, glass_ele
 from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 from dolens.optics.elements import DISPLACEMENTS, TILTS
 from dolens.optics.lens import Lens
-from dolens.optics.tables import printable
+from dolens.optics.text_tables import printable
 from dolens.plotting.section import sensor_curve
 
 

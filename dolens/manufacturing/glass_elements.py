@@ -17,10 +17,9 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
-from dolens.optics.straight import require_refracting
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Rectangle
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_refracting
 
 # Lengths that differ by less than this (mm) are the same to a workshop and to a solid modeller.
 SAME_LENGTH = 1e-6

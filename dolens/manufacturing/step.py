@@ -18,7 +18,7 @@ from dolens.manufacturing.modeller import Shape, occ, parts, point, volume
 from dolens.manufacturing.solids import element_solid
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Rectangle
-from dolens.optics.tables import printable
+from dolens.optics.text_tables import printable
 
 _PROGRAM = "dolens"
 # Sky blue, as glass is drawn.

@@ -1,22 +1,24 @@
-"""Catalogue glasses by name: of the makers' tables that come with dolens, and of the user's own.
+"""Catalogue glasses by name: of the makers' tables that come with dolens, and of the user's own."""
 
-A name is written with its catalogue, `SCHOTT:N-BK7`, or alone where it says enough.  Alone, it is
-looked for among the makers and the plastics, then in the user's catalogues, then in the further
-tables (`MISC`, `INFRARED`, ...), and must mean one medium where it is found.  Names that only
-further editions of a maker's catalogue have, other than Schott's, come after the main ones.
-"""
-
+import csv
 import difflib
+import io
+import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
+from functools import cache, lru_cache
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.glass import Glass
-from dolens.optics.glass_folders import user_catalogues, user_entries, user_glass
-from dolens.optics.glass_tables import FURTHER, MAKERS, is_main, table, table_glass
-from dolens.optics.thermal import Environment
+from dolens.files import decode_text, read_file
+from dolens.optics import dispersion
+from dolens.optics.agf import AgfEntry, parse_agf, read_entry
+from dolens.optics.glass import Environment, Glass, ThermalCoefficients
 
 __all__ = [
     "Glass",
@@ -188,3 +190,165 @@ def _further() -> list[str]:
     """Return the names of all other catalogues."""
     others = [catalogue for catalogue in catalogues() if catalogue not in MAKERS]
     return [name for catalogue in others for name in glass_names(catalogue)]
+
+
+# The makers whose names mean their glasses without saying so, in the order of messages; and the
+# others, whose glasses a bare name means where none of those has it.
+MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM", "SUMITA", "HIKARI", "PLASTIC")
+FURTHER = (
+    *("MISC", "INFRARED", "SCHOTT_IG", "CORNING", "HERAEUS", "LZOS", "EYE", "BIREFRINGENT"),
+    *("LIGHTPATH", "RPO", "NHG", "PILKINGTON", "ARCHER", "TOPAS", "ZEON", "UMICORE"),
+    *("ISUZU", "RAD_HARD"),
+)
+_FORMULAS = {
+    formula.__name__: formula
+    for formula in (
+        dispersion.sellmeier,
+        dispersion.sellmeier_squared,
+        dispersion.sellmeier_with_offset,
+        dispersion.sellmeier_with_pole,
+        dispersion.pole_and_powers,
+        dispersion.resonance_and_powers,
+        dispersion.polynomial,
+        dispersion.cauchy,
+        dispersion.herzberger,
+    )
+}
+_NM_PER_UM = 1000.0
+# The source of the names that mean a maker's glass wherever no other maker here has them: the
+# catalogues of 2013 to 2022 in refractiveindex.info's database.
+_MAIN_SOURCE = "rii"
+
+
+def is_main(maker: str, key: str) -> bool:
+    """Tell whether a bare name may mean a maker's glass before those of other editions.
+
+    Schott's old glasses are among them: files name them without saying whose they are.
+    """
+    return maker == "SCHOTT" or table(maker)[key]["source"] == _MAIN_SOURCE
+
+
+@cache
+def table(maker: str) -> dict[str, dict[str, str]]:
+    """Return name in capitals → row of a maker's table.
+
+    Raises:
+        InputError: no table is of that maker.
+    """
+    if maker not in MAKERS + FURTHER:
+        raise InputError(f"no maker '{maker}' (allowed: {', '.join(MAKERS + FURTHER)})")
+    file = resources.files("dolens.optics").joinpath("glass_data", f"{maker.lower()}.csv")
+    rows = csv.DictReader(io.StringIO(file.read_text(encoding="ascii"), newline=""))
+    return {row["name"].upper(): row for row in rows}
+
+
+def table_glass(maker: str, key: str) -> Glass:
+    """Return the glass of a maker's table under that name in capitals, in its own environment."""
+    row: dict[str, Any] = table(maker)[key]
+    first, last = (round(_NM_PER_UM * float(word), 6) for word in row["range_um"].split())
+    thermal = [float(word) for word in row["thermal"].split()]
+    return Glass(
+        f"{maker}:{row['name']}",
+        _FORMULAS[row["formula"]],
+        float(row["constant"]),
+        _pairs(row["terms"]),
+        (first, last),
+        thermal=ThermalCoefficients(*thermal) if thermal else None,
+        expansion=1e-6 * float(row["expansion"]) if row["expansion"] else None,
+    )
+
+
+def _pairs(text: str) -> tuple[tuple[float, float], ...]:
+    values = [float(word) for word in text.split()]
+    return tuple(zip(values[::2], values[1::2], strict=True))
+
+
+VARIABLE = "DOLENS_GLASS"
+_NM_PER_UM_OF_AGF = 1000.0
+# The largest catalogue of a maker has 2 MB.
+_LARGEST = 32 * 2**20
+# Set for as long as a lens is read or written, by `glass_folders`.
+_asked: ContextVar[tuple[Path, ...]] = ContextVar("glass folders", default=())
+
+
+@contextmanager
+def glass_folders(places: Sequence[str | Path] | str | Path | None) -> Iterator[None]:
+    """Look for glasses in these folders or `.agf` files, too, within a `with` statement.
+
+    Raises:
+        InputError: one of them does not exist.
+    """
+    given = [places] if isinstance(places, str | Path) else list(places or ())
+    paths = tuple(Path(place) for place in given)
+    for path in paths:
+        if not os.path.exists(path):
+            raise InputError(f"glass catalogues: '{path}' is no folder and no file")
+    token = _asked.set((*paths, *_asked.get()))
+    try:
+        yield
+    finally:
+        _asked.reset(token)
+
+
+def user_catalogues() -> dict[str, Path]:
+    """Return catalogue → file; the first folder that has a catalogue's name gives it.
+
+    Raises:
+        InputError: a place that `DOLENS_GLASS` names does not exist.
+    """
+    named = [Path(place) for place in os.environ.get(VARIABLE, "").split(os.pathsep) if place]
+    found: dict[str, Path] = {}
+    for place in (*_asked.get(), *named):
+        if os.path.isdir(place):
+            files = sorted(p for p in _listed(place) if p.suffix.lower() == ".agf")
+        elif os.path.exists(place):
+            files = [place]
+        else:
+            raise InputError(f"{VARIABLE}: '{place}' is no folder and no file")
+        for file in files:
+            found.setdefault("".join(file.stem.upper().split()), file)
+    return found
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror})") from None
+
+
+def user_entries(file: Path) -> dict[str, AgfEntry]:
+    """Return name in capitals → entry of a user's catalogue.
+
+    Raises:
+        InputError: the file cannot be read, or is no catalogue.
+    """
+    try:
+        state = file.stat()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    return _entries(file, state.st_mtime_ns, state.st_size)
+
+
+def user_glass(catalogue: str, entry: AgfEntry) -> Glass:
+    """Return a glass of a user's catalogue, in its own environment.
+
+    Raises:
+        InputError: its numbers cannot be read (see `dolens.optics.agf.read_entry`).
+    """
+    glass = read_entry(entry)
+    first, last = (round(_NM_PER_UM_OF_AGF * end, 6) for end in glass.wavelengths)
+    return Glass(
+        f"{catalogue}:{glass.name}",
+        *glass.dispersion,
+        (first, last),
+        thermal=glass.thermal,
+        expansion=glass.expansion,
+    )
+
+
+# The time and size of the file are part of the key: an edited catalogue is read again.
+@lru_cache(maxsize=64)
+def _entries(file: Path, changed: int, size: int) -> dict[str, AgfEntry]:
+    data = read_file(file, _LARGEST, "glass catalogue")
+    return parse_agf(decode_text(data, str(file)), str(file))

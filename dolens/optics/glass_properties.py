@@ -1,7 +1,7 @@
 """What a catalogue says of its glasses besides their indices: status, price, density, resistance.
 
 The tables that come with dolens hold indices, dn/dT and expansion alone.  The rest is read from a
-maker's `.agf` file in the user's folders (see `dolens.optics.glass_folders`).
+maker's `.agf` file in the user's folders (see `dolens.optics.glass_catalog`).
 """
 
 from collections.abc import Mapping
@@ -9,12 +9,19 @@ from dataclasses import dataclass, field
 
 from dolens.errors import InputError
 from dolens.optics.agf import RESISTANCES, AgfEntry, read_entry
-from dolens.optics.glass import Glass
-from dolens.optics.glass_catalog import catalogues, suggestion
-from dolens.optics.glass_folders import user_catalogues, user_entries, user_glass
-from dolens.optics.glass_tables import FURTHER, MAKERS, table, table_glass
+from dolens.optics.glass import STANDARD_TEMPERATURE, Glass, absolute_change
+from dolens.optics.glass_catalog import (
+    FURTHER,
+    MAKERS,
+    catalogues,
+    suggestion,
+    table,
+    table_glass,
+    user_catalogues,
+    user_entries,
+    user_glass,
+)
 from dolens.optics.materials import LINE_D
-from dolens.optics.thermal import STANDARD_TEMPERATURE, absolute_change
 
 _NM_PER_UM = 1000.0
 # K; the absolute index is a polynomial of the third degree in the temperature.

@@ -1,37 +1,110 @@
-"""A lens: the state that everything else is a function of."""
+"""A lens: surfaces, gaps, media, elements and a sensor, as a PyTorch module."""
 
 import difflib
 import fnmatch
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.optics.axial_ray import reversals
-from dolens.optics.backend import check_backend, is_few
-from dolens.optics.broken_axes import GlobalAxes
-from dolens.optics.departures import astigmatism_of, index_offsets, irregular
 from dolens.optics.dispersion import require_wavelengths
-from dolens.optics.elements import Element, ElementState
+from dolens.optics.elements import Element, ElementState, check_elements
+from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
-from dolens.optics.kept_system import KeptSystem
-from dolens.optics.lens_checks import check_lens
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
-from dolens.optics.materials import Medium
-from dolens.optics.mirrors import media_of
-from dolens.optics.module_table import ModuleTable
+from dolens.optics.materials import MIRROR, Medium, media_of
 from dolens.optics.paraxial import vergence
-from dolens.optics.published import Published
-from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.paraxial_rays import ideal_lenses, reversals, with_vergences
+from dolens.optics.ray_tracing import check_backend, is_few, trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.coordinate_break import GlobalAxes
 from dolens.optics.surfaces.state import LawState, SurfaceState
-from dolens.optics.system import OpticalSystem
-from dolens.optics.vergence import ideal_lenses, with_vergences
+from dolens.optics.system import KeptSystem, OpticalSystem
+
+
+def check_lens(
+    surfaces: Sequence[Surface],
+    thicknesses: Sequence[float],
+    materials: Sequence[Medium],
+    stop: int,
+    elements: Mapping[str, Element],
+) -> None:
+    """Raise `InputError` where the parts of a lens do not go together; see `Lens`.
+
+    The numbers of gaps and media must be those of the surfaces, the stop one of them that light
+    meets, mirrors without a law of their own, and a coordinate break within one medium.
+    """
+    count = len(surfaces)
+    if count == 0 or len(thicknesses) != count - 1 or len(materials) != count + 1:
+        raise InputError(
+            f"{count} surfaces need {count - 1} thicknesses and {count + 1} "
+            f"materials, not {len(thicknesses)} and {len(materials)}"
+        )
+    if not 1 <= stop <= count:
+        raise InputError(f"stop must be a surface from 1 to {count}, not {stop}")
+    media = media_of(tuple(materials)).materials
+    for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
+        if surface.law is not None and medium is MIRROR:
+            raise InputError(f"surface {number}: a {surface.law.kind} cannot be a mirror")
+    check_elements(elements, count)
+    if all(surface.changes_axes for surface in surfaces):
+        raise InputError("there is no surface but coordinate breaks")
+    for number, surface in enumerate(surfaces, 1):
+        if not surface.changes_axes:
+            continue
+        place = f"surface {number} is a coordinate break"
+        if number == stop:
+            raise InputError(f"{place}, and cannot be the stop")
+        if media[number] != media[number - 1]:
+            raise InputError(f"{place}; the medium behind it is the one in front of it")
+
+
+class Published(NamedTuple):
+    """A `Published` holds the numbers that a patent, book or catalogue prints beside a lens.
+
+    They are data: nothing is computed from them, and they stay as they are when the lens changes.
+    None is what the source does not say.
+
+    Attributes:
+        kind: what lens it is, in the field's words, such as `Tessar`.
+        efl: effective focal length, mm; without a sign.
+        efl_tolerance: mm, by how much the prescription may miss it: half a unit of its last printed
+            digit, or more where the rounding of radii, gaps and indices allows more.
+        f_number: EFL over the diameter of the entrance pupil.
+        na: numerical aperture in image space.
+        object_na: numerical aperture in object space.
+        entrance_pupil_diameter: mm.
+        half_field: degrees.
+        image_height: mm, from the axis to the edge of the image.
+        object_height: mm.
+        bfd: back focal distance, mm.
+        length: from the first to the last vertex, mm.
+        track: from the first vertex to the image, mm.
+        magnification: image over object height.
+        note: what a reader must know: misprints, a place of the stop that is not printed, a scale.
+    """
+
+    kind: str | None = None
+    efl: float | None = None
+    efl_tolerance: float | None = None
+    f_number: float | None = None
+    na: float | None = None
+    object_na: float | None = None
+    entrance_pupil_diameter: float | None = None
+    half_field: float | None = None
+    image_height: float | None = None
+    object_height: float | None = None
+    bfd: float | None = None
+    length: float | None = None
+    track: float | None = None
+    magnification: float | None = None
+    note: str | None = None
 
 
 class Lens(LensRays, LensViews, InStates, nn.Module):
@@ -187,7 +260,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         Args:
             values: parameter name → tensor used instead of the stored one; besides them
                 `surfaces.<n>.semi_diameter` of a circular aperture, mm, and what
-                `dolens.optics.departures` names, which no lens stores as parameters.
+                `dolens.optics.fabrication_errors` names, which no lens stores as parameters.
         """
         if not values:
             return self._kept_system.of(self, self._system)
@@ -259,7 +332,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         """Trace rays from the object through every surface to the sensor, plane or curved.
 
         With backend `auto`, fast kernels trace many rays, and PyTorch a few, so that these wait for
-        no compiler; see `dolens.optics.backend.is_few`.  Results agree to rounding.  A loop over
+        no compiler; see `dolens.optics.ray_tracing.is_few`.  Results agree to rounding.  A loop over
         few rays is faster with the kernels: set `backend` to `cpu`.
 
         Args:
@@ -335,3 +408,20 @@ def _named_parameters(module: nn.Module, prefix: str = "") -> Iterator[tuple[str
     for name, child in module._modules.items():
         if child is not None:
             yield from _named_parameters(child, f"{prefix}{name}.")
+
+
+Kind = TypeVar("Kind", bound=nn.Module)
+
+
+class ModuleTable(nn.ModuleDict, Generic[Kind]):
+    """Torch's table of modules, which tells a type checker what kind of module it holds."""
+
+    if TYPE_CHECKING:
+
+        def __getitem__(self, key: str) -> Kind: ...
+
+        def values(self) -> ValuesView[Kind]:
+            """Return the modules."""
+
+        def items(self) -> ItemsView[str, Kind]:
+            """Return names and modules."""

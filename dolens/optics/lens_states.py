@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, did_you_mean
-from dolens.optics.axial_ray import reversals
-from dolens.optics.state_names import values_in_state
+from dolens.optics.glass import STANDARD_TEMPERATURE
+from dolens.optics.parameter_names import values_in_state
+from dolens.optics.paraxial_rays import reversals
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.thermal import STANDARD_TEMPERATURE
 from dolens.optics.thermal_lens import expanded_values, lens_at
 
 # Attributes of a lens that a state may have otherwise.

@@ -1,4 +1,12 @@
-"""First-order optics: focal length, cardinal points, pupils.  Everything is differentiable.
+"""First-order optics: the paraxial recurrence, focal length, cardinal points and pupils.
+
+Everything is differentiable.
+
+A paraxial ray at a surface is its height y and its reduced slope n·u.  Refraction leaves the height
+alone, n'u' = nu - y(n' - n)c; transfer leaves the reduced slope alone, y' = y + (t/n)·nu (Welford,
+ch. 3).  Any two rays give all others, so that two are traced at a time.  Everything here is
+arithmetic of numbers and tensors alike.  Where light travels towards -z the index is negative.
+What adds to a surface's power (n' - n)c, a diffractive phase or an ideal lens, adds to it here.
 
 Light that travels towards -z, behind an odd number of mirrors, has a negative index there and gaps
 of negative thickness: then every equation of refraction holds, and a concave mirror of R = -200 mm
@@ -9,19 +17,97 @@ What lies at infinity (the foci of an afocal lens, the pupil of a telecentric on
 carries a zero gradient, so that one infinite quantity leaves the gradients of the others alone.
 Only a power that is exactly zero counts: a telescope whose power is a rounding error has an EFL of
 1e15 mm or so.  A constraint that must cross zero is better put on `power`.
+
 """
 
 import math
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
-from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
+
+Number = Any  # of Python's, or a tensor
+
+
+class TwoRays(NamedTuple):
+    """Heights y and reduced slopes n·u of two rays at one plane.
+
+    Of the rays of unit height and of unit reduced slope, these are the rows of the matrix
+    [[A, B], [C, D]] that acts on (y, n·u).
+
+    Attributes:
+        y: height of the first ray.
+        y2: height of the second.
+        nu: reduced slope of the first ray.
+        nu2: reduced slope of the second.
+    """
+
+    y: Number
+    y2: Number
+    nu: Number
+    nu2: Number
+
+    def transferred(self, thickness: Number, index: Number) -> "TwoRays":
+        """The rays behind a gap of a medium."""
+        gap = thickness / index
+        return TwoRays(self.y + gap * self.nu, self.y2 + gap * self.nu2, self.nu, self.nu2)
+
+
+UNIT_RAYS = TwoRays(1.0, 0.0, 0.0, 1.0)
+
+
+def through_surfaces(
+    rays: TwoRays,
+    curvatures: Sequence[Number],
+    thicknesses: Sequence[Number],
+    indices: Sequence[Number],
+    powers: Sequence[Number] | None = None,
+) -> Iterator[TwoRays]:
+    """Trace two rays from just before the first of some surfaces to just behind the last.
+
+    Args:
+        rays: before the first surface, mm.
+        curvatures: paraxial, of N surfaces, 1/mm.
+        thicknesses: of the N - 1 gaps between them, mm.
+        indices: of the N + 1 media around them.
+        powers: of the N surfaces besides that of refraction, 1/mm; None: they have none.
+
+    Yields:
+        The rays just behind each surface, at the heights that they have on it.
+    """
+    y, y2, nu, nu2 = rays
+    for i, curvature in enumerate(curvatures):
+        before, behind = indices[i], indices[i + 1]
+        if i:
+            gap = thicknesses[i - 1] / before
+            y, y2 = y + gap * nu, y2 + gap * nu2
+        power = (behind - before) * curvature
+        if powers is not None:
+            power = power + powers[i]
+        nu, nu2 = nu - power * y, nu2 - power * y2
+        yield TwoRays(y, y2, nu, nu2)
+
+
+def behind_surfaces(
+    curvatures: Sequence[Number],
+    thicknesses: Sequence[Number],
+    indices: Sequence[Number],
+    powers: Sequence[Number] | None = None,
+) -> TwoRays:
+    """Trace the unit rays to just behind the last of some surfaces; themselves where there is none.
+
+    Arguments as of `through_surfaces`.
+    """
+    every = through_surfaces(UNIT_RAYS, curvatures, thicknesses, indices, powers)
+    last = deque(every, maxlen=1)
+    return last[0] if last else UNIT_RAYS
 
 
 class Pupil(NamedTuple):
@@ -233,3 +319,77 @@ def _matrix(rays: TwoRays, like: OpticalSystem) -> Tensor:
     """The 2×2 matrix that takes the unit rays to these."""
     entries = [torch.as_tensor(e, dtype=like.dtype, device=like.device) for e in rays]
     return torch.stack(entries).reshape(2, 2)
+
+
+def curvatures_of(
+    system: OpticalSystem, first: int = 1, last: int | None = None
+) -> list[Tensor | float]:
+    """Return the paraxial curvatures (1/mm) of surfaces `first` to `last`, from 1: the means over
+    azimuth, or those along the system's meridian.
+    """
+    return [
+        s.shape.paraxial_curvature(s.parameters)
+        if system.meridian is None or s.shape.rotational
+        else s.shape.section_curvature(s.parameters, *_direction(system, number))
+        for number, s in _numbered(system, first, last)
+    ]
+
+
+def powers_of(
+    system: OpticalSystem, wavelength: float | Tensor, first: int = 1, last: int | None = None
+) -> list[Tensor | float] | None:
+    """Return the powers (1/mm) that phases and ideal lenses add to surfaces `first` to `last`.
+
+    Args:
+        system: the lens.
+        wavelength: nm.
+        first: number of the first surface, from 1.
+        last: number of the last; None: of the lens.
+
+    Returns:
+        One power a surface, or None where none adds any: the mean over azimuth, or that along the
+        system's meridian.
+    """
+    if not deflects(system.surfaces[first - 1 : last]):
+        return None
+    found: list[Tensor | float] = []
+    for number, surface in _numbered(system, first, last):
+        own = surface.deflection
+        if own is None:
+            found.append(0.0)
+        elif system.meridian is None or own.law.rotational:
+            found.append(own.law.paraxial_power(own.parameters).at(wavelength))
+        else:
+            way = _direction(system, number)
+            found.append(own.law.section_power(own.parameters, *way).at(wavelength))
+    return found
+
+
+def _numbered(
+    system: OpticalSystem, first: int, last: int | None
+) -> list[tuple[int, SurfaceState]]:
+    return list(enumerate(system.surfaces, 1))[first - 1 : last]
+
+
+def _direction(system: OpticalSystem, number: int) -> tuple[Number, Number]:
+    """Return the direction (x, y) of the system's meridian in a surface's own axes, of length one.
+
+    Turns about z turn it; of other tilts, as of a fold, the lens is unfolded along its axis.
+    """
+    along_x = system.meridian == "x"
+    rotation = system.axes[number - 1].rotation
+    if rotation is None:
+        return (1.0, 0.0) if along_x else (0.0, 1.0)
+    # Of the lens's x and y the one that lies more across the surface's axis tells the turn.
+    x, y = rotation[0, :2], rotation[1, :2]
+    if float(x.norm()) >= float(y.norm()):
+        cosine, sine = (x / x.norm()).unbind()
+    else:
+        cosine, sine = (y / y.norm()).flip(0).unbind()
+        sine = -sine
+    return (cosine, sine) if along_x else (-sine, cosine)
+
+
+def deflects(surfaces: Sequence[SurfaceState]) -> bool:
+    """Return whether any of the surfaces deflects light by a law of its own."""
+    return any(s.deflection is not None for s in surfaces)

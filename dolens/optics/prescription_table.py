@@ -7,13 +7,12 @@ from typing import Any
 import torch
 
 from dolens.optics.elements import TILTS, Element, carriers
-from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
-from dolens.optics.mirrors import MIRROR
-from dolens.optics.parameter_units import to_file_units
+from dolens.optics.materials import LINE_C, LINE_F, MIRROR, Medium, abbe_number, index_d
+from dolens.optics.parameter_names import to_file_units
 from dolens.optics.surfaces import CoordinateBreak
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
 from dolens.optics.surfaces.outlines import Polygons
-from dolens.optics.tables import html_table, printable, text_table
+from dolens.optics.text_tables import html_table, printable, text_table
 
 HEADINGS = (
     "surface",

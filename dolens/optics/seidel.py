@@ -41,8 +41,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.paraxial import deflects, powers_of
 from dolens.optics.paraxial_rays import ParaxialRay, paraxial_rays
-from dolens.optics.paraxial_surfaces import deflects, powers_of
 from dolens.optics.surfaces.ideal_lens import IdealLens
 from dolens.optics.system import OpticalSystem
 

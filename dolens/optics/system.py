@@ -1,19 +1,30 @@
-"""A lens as pure functions see it: tensors and names, no state."""
+"""A lens as pure functions see it: an `OpticalSystem` of tensors and names, without state.
+
+Analyses that hold only for refracting surfaces along one axis refuse other systems here.  A lens
+keeps the last system made of it while it is made of the same things.
+
+A system holds the lens's own tensors, so that it stays the lens's whatever their values become; it
+is made anew as soon as anything stands in the place of a tensor, a surface, an aperture or a medium
+that it was made of.
+
+"""
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from itertools import chain
+from operator import attrgetter, is_, itemgetter
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.optics.broken_axes import GlobalAxes, broken_axes
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
 from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
 from dolens.optics.surfaces.deflection import Law
 from dolens.optics.surfaces.state import SurfaceState
 
@@ -46,7 +57,7 @@ class OpticalSystem:
         from_the_side: whether light comes at 90° to the axis and more; its rays meet spheres and
             conics along their vertex plane and from behind it, and are traced by the reference.
         backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
-            `auto`; see `dolens.optics.backend.choose_backend`.
+            `auto`; see `dolens.optics.ray_tracing.choose_backend`.
         index_offsets: added to the indices of these media, the same at all wavelengths; () where
             none is.
         meridian: the section of the lens that first-order optics is of, `x` (the x-z plane) or `y`;
@@ -223,4 +234,161 @@ class OpticalSystem:
         """The same lens with apertures that clip nothing."""
         return replace(
             self, surfaces=[replace(s, aperture=s.aperture.opened()) for s in self.surfaces]
+        )
+
+
+class KeptSystem:
+    """Holds one system, and what it was made of.  A copy of a lens keeps its own."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[_Places, _Parts, OpticalSystem] | None = None
+
+    def __deepcopy__(self, memo: object) -> "KeptSystem":
+        """Return an empty one."""
+        return KeptSystem()
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        """Pickle nothing."""
+        return KeptSystem, ()
+
+    def of(
+        self, lens: nn.Module, make: Callable[[dict[str, Tensor]], OpticalSystem]
+    ) -> OpticalSystem:
+        """Return the system of a lens as it is now.
+
+        Args:
+            lens: a `Lens`.
+            make: makes its system, with values in the place of stored ones; here there are none.
+        """
+        if torch.compiler.is_compiling():
+            return make({})
+        kept = self._kept  # at once: other threads may trace the same lens
+        if kept is not None:
+            places, known, system = kept
+            if places.are_of(lens) and known.are_the_same(places.parts(lens)):
+                return system
+        places = _places(lens)
+        parts = places.parts(lens)
+        system = make({})
+        if _may_stay(parts.things, system):
+            self._kept = (places, parts, system)
+        return system
+
+
+# Of a lens; its materials may be a list, whose entries are looked at.
+_ATTRIBUTES = itemgetter("stop", "backend", "reversals", "fields")
+_OF_SURFACE = attrgetter("aperture")
+_OF_ELEMENT = attrgetter("first", "last", "pivot")
+
+
+class _Parts(NamedTuple):
+    """All that a system is made of, and the names of these in their tables."""
+
+    things: list[Any]
+    names: list[str]
+
+    def are_the_same(self, others: "_Parts") -> bool:
+        """Return whether the same objects have the same names: they make the same system."""
+        things = others.things
+        if len(self.things) != len(things) or self.names != others.names:
+            return False
+        return all(map(is_, self.things, things))
+
+
+class _Places(NamedTuple):
+    """All that a system is made of stands here.
+
+    Attributes:
+        tables: of PyTorch's, with parameters, buffers and modules; those of the lens itself first.
+        empty: such tables without an entry.
+        surfaces: the modules themselves.
+        elements: likewise.
+    """
+
+    tables: tuple[dict[str, Any], ...]
+    empty: tuple[dict[str, Any], ...]
+    surfaces: tuple[nn.Module, ...]
+    elements: tuple[nn.Module, ...]
+
+    def are_of(self, lens: nn.Module) -> bool:
+        """Return whether they are all of a lens's places: tables in other modules are found from
+        its own.
+        """
+        if lens._parameters is not self.tables[0] or lens._modules is not self.tables[1]:
+            return False
+        return not any(self.empty)
+
+    def parts(self, lens: nn.Module) -> _Parts:
+        """Return what stands there now."""
+        own = lens.__dict__
+        things = [*_ATTRIBUTES(own), *own["materials"]]
+        things += chain.from_iterable(map(dict.values, self.tables))
+        things += map(_OF_SURFACE, self.surfaces)
+        things += chain.from_iterable(map(_OF_ELEMENT, self.elements))
+        return _Parts(things, [*chain.from_iterable(self.tables)])
+
+
+def _places(lens: nn.Module) -> _Places:
+    """Return where the parts of a lens stand."""
+    modules: Any = lens._modules
+    surfaces = tuple(modules["surfaces"]._modules.values())
+    elements = tuple(modules["elements"]._modules.values())
+    phases = (surface.phase for surface in surfaces if surface.phase is not None)
+    tables = [modules[name]._modules for name in ("surfaces", "elements")]
+    for module in (modules["thicknesses"], *surfaces, *phases, *elements):
+        tables += (module._parameters, module._buffers, module._modules)
+    return _Places(
+        (lens._parameters, lens._modules, *filter(None, tables)),
+        tuple(table for table in tables if not table),
+        surfaces,
+        elements,
+    )
+
+
+def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
+    """Return whether a system holds nothing that a call leaves behind: values that
+    `functional_call` puts in the place of parameters, or numbers computed from parameters.
+    """
+    stored = {id(part) for part in parts if isinstance(part, Tensor) and _is_plain(part)}
+    tensors = [*system.thicknesses, system.sensor_distance]
+    for surface in (*system.surfaces, system.image):
+        if surface is not None:
+            tensors += surface.parameters.values()
+            if surface.deflection is not None:
+                tensors += surface.deflection.parameters.values()
+    for element in system.elements:
+        tensors += element.parameters.values()
+    return all(id(tensor) in stored for tensor in tensors)
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Return whether a tensor is a parameter, or a buffer without a graph."""
+    if isinstance(tensor, nn.Parameter):
+        return True
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return not tensor.requires_grad and not wrapped
+
+
+def require_refracting(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where a lens has mirrors or coordinate breaks.
+
+    Args:
+        system: the lens.
+        what: cannot be done with it; the message begins with it.
+    """
+    for numbers, kind in ((system.mirrors, "a mirror"), (system.breaks, "a coordinate break")):
+        if numbers:
+            raise InputError(
+                f"{what}: surface {numbers[0]} is {kind}; only lenses of refracting surfaces along "
+                "one axis are held there"
+            )
+
+
+def require_plane_sensor(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where the sensor of a lens is curved; arguments as above."""
+    if system.image is not None:
+        curvature = float(system.image.parameters["curvature"].detach())
+        radius = math.copysign(math.inf, curvature) if curvature == 0.0 else 1.0 / curvature
+        raise InputError(
+            f"{what}: the sensor is curved (radius {radius:g} mm); only a plane one is held there"
         )

@@ -19,12 +19,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.glass import Glass
-from dolens.optics.materials import Medium
-from dolens.optics.mirrors import media_of
+from dolens.optics.glass import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment, Glass
+from dolens.optics.materials import Medium, media_of
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
-from dolens.optics.thermal import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.cpu import bounded_steps as kernel
+from dolens.kernels.cpu import least_squares as kernel
 
 # A step is taken when it lowers the merit by this part of what the model predicts, or more.
 _LEAST_GAIN = 1e-4

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.row_jacobian import jacobian_by_columns, jacobian_of
+from dolens.optics.autograd import jacobian_by_columns, jacobian_of
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.operand_values import (

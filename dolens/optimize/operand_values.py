@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.optics.autograd import jacobian_of
 from dolens.optics.lens import Lens
-from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.operands import LensProperties, Operand
 from dolens.optimize.variables import DesignVariables

@@ -14,9 +14,8 @@ from torch import Tensor
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import values_there
-from dolens.optics.parameter_units import to_lens_units
+from dolens.optics.parameter_names import STATES, split_state, to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
-from dolens.optics.state_names import STATES, split_state
 
 SOLVES = ("efl", "paraxial_focus", "best_focus")
 _FOLLOWING = ("pickup", "solve")

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.autograd import jacobian_of
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import state_temperature, values_there
-from dolens.optics.row_jacobian import jacobian_of
-from dolens.optics.state_names import STATES, names_of_state, split_state, values_in_state
+from dolens.optics.parameter_names import STATES, names_of_state, split_state, values_in_state
 from dolens.optimize.image_quality import ImageQuality, QualityValues
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.merit import MeritFunction

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
+from dolens.optics.autograd import jacobian_of
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import to_file_units, to_lens_units, unit_factors, unit_of
-from dolens.optics.row_jacobian import jacobian_of
+from dolens.optics.parameter_names import to_file_units, to_lens_units, unit_factors, unit_of
 from dolens.optimize.pickups_and_solves import Dependent, dependent, of_each_state
 from dolens.typed_values import check_type
 
@@ -28,7 +28,7 @@ class DesignVariables(nn.Module):
     A parameter may also follow from others: a pickup or a solve (see `dependents`).  Patterns leave
     such parameters out.
 
-    Settings are in the units of files, degrees for tilts (see `dolens.optics.parameter_units`); θ
+    Settings are in the units of files, degrees for tilts (see `dolens.optics.parameter_names`); θ
     is in the lens's own units, radians and mm.
 
     Args:

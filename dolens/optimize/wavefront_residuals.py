@@ -11,7 +11,7 @@ from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optics.rays import TracedRays
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.optimize.image_quality import ImageQuality
 
 _OUTPUTS = ("x", "y", "path_length", "l", "m")

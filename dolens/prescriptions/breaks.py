@@ -16,7 +16,7 @@ import torch
 
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.elements import TILTS
-from dolens.optics.parameter_units import file_value, to_lens_units
+from dolens.optics.parameter_names import file_value, to_lens_units
 from dolens.optics.surfaces import BREAKS, CoordinateBreak
 from dolens.optics.surfaces.coordinate_break import BREAK
 from dolens.prescriptions.checks import as_number

@@ -38,7 +38,7 @@ import torch
 from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
-from dolens.optics.mirrors import media_of
+from dolens.optics.materials import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError, check_keys
+from dolens.optics.field_and_aperture import heights_of_pupil_angles, object_fields
 from dolens.optics.fields import Fields, Vignetting
-from dolens.optics.image_heights import heights_of_pupil_angles, object_fields
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.prescriptions.checks import as_number, require_mapping

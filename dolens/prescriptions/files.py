@@ -10,7 +10,7 @@ import torch
 
 from dolens.errors import InputError, did_you_mean
 from dolens.files import packaged_configuration, read_file, written_whole
-from dolens.optics.glass_folders import glass_folders
+from dolens.optics.glass_catalog import glass_folders
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
@@ -170,7 +170,7 @@ def load_lens(
     Rarely needed:
         backend: auto, reference, cpu or cuda.
         glass_catalogues: folders of `.agf` files, or such files, besides those that the environment
-            variable `DOLENS_GLASS` names (see `dolens.optics.glass_folders`).
+            variable `DOLENS_GLASS` names (see `dolens.optics.glass_catalog`).
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.glass import Glass
+from dolens.optics.glass import Environment, Glass
 from dolens.optics.materials import IndexModel, Medium, index_model, parse_material
-from dolens.optics.thermal import Environment
 from dolens.prescriptions.checks import as_number
 
 # 1e-6/K: of the mount of the air gap behind a surface, or of glass whose catalogue does not say.

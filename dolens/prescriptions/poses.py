@@ -15,7 +15,7 @@ import torch
 
 from dolens.errors import InputError, check_keys
 from dolens.optics.elements import DISPLACEMENTS, TILTS, Element
-from dolens.optics.parameter_units import file_value, to_lens_units
+from dolens.optics.parameter_names import file_value, to_lens_units
 from dolens.prescriptions.checks import as_integer, as_number, require_mapping
 
 # A tilt that no number of degrees gives to the last bit is written in radians, under this name.

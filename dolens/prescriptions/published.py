@@ -4,13 +4,13 @@ Every key is optional; lengths are in mm, angles in degrees::
 
     published: {kind: Tessar, efl: 100, efl_tolerance: 0.5, f_number: 3.5, half_field: 25.7}
 
-See `dolens.optics.published.Published`.
+See `dolens.optics.lens.Published`.
 """
 
 from typing import Any
 
 from dolens.errors import InputError, check_keys
-from dolens.optics.published import Published
+from dolens.optics.lens import Published
 from dolens.prescriptions.checks import as_number, as_positive, require_mapping
 
 PUBLISHED_KEY = "published"

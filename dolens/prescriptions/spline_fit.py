@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.spline_basis import check_knots
+from dolens.optics.surfaces.b_spline import check_knots
 
 # A column of the least-squares problem that the others explain to this fraction has no data.
 DEPENDENT = 1e-12

@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dolens.errors import InputError, check_keys
+from dolens.optics.glass import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import (
     LensState,
@@ -30,7 +31,6 @@ from dolens.optics.lens_states import (
     overlaid,
     state_of_difference,
 )
-from dolens.optics.thermal import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, is_automatic
 from dolens.prescriptions.automatic_apertures import set_common_semi_diameters
 from dolens.prescriptions.checks import as_number, require_mapping

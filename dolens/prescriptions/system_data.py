@@ -29,7 +29,7 @@ A pupil closes the stop: its semi-diameter becomes the one whose paraxial image 
 at the reference wavelength, and stays what the prescription says where that is smaller.  With
 `real_pupil: true` its rim is where the real marginal ray to the rim of that image crosses it.
 A lens has fields by angles or by heights on the object: those that a prescription gives by the
-image or the pupil are converted when the lens is built (`dolens.optics.image_heights`).
+image or the pupil are converted when the lens is built (`dolens.optics.field_and_aperture`).
 """
 
 import math
@@ -41,10 +41,9 @@ import torch
 
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
+from dolens.optics.field_and_aperture import in_double_precision, real_marginal_height
 from dolens.optics.fields import require_from_the_front
-from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
-from dolens.optics.marginal_ray import real_marginal_height
 from dolens.optics.paraxial import matrix_to_stop, vergence
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.prescriptions.apertures import is_automatic

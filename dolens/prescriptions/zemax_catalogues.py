@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from decimal import Decimal
 
 from dolens.errors import InputError
-from dolens.optics.glass_catalog import catalogues as known_catalogues
 from dolens.optics.glass_catalog import (
+    MAKERS,
     find_glass,
     glass_names,
     is_old_name,
@@ -15,7 +15,7 @@ from dolens.optics.glass_catalog import (
     makers_of,
     suggestion,
 )
-from dolens.optics.glass_tables import MAKERS
+from dolens.optics.glass_catalog import catalogues as known_catalogues
 from dolens.optics.materials import Medium, abbe_number, index_d
 
 # Zemax prints what its catalogue gives: half of what tells Schott's F2 from Hikari's.  Where a file

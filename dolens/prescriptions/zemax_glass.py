@@ -17,10 +17,9 @@ import re
 from collections.abc import Sequence
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import deviation_of_two_terms
 from dolens.optics.glass_catalog import find_glass, makers_of
-from dolens.optics.materials import LARGEST_DEVIATION, Medium, index_model, parse_material
-from dolens.optics.mirrors import MIRROR
-from dolens.optics.model_glass import deviation_of_two_terms
+from dolens.optics.materials import LARGEST_DEVIATION, MIRROR, Medium, index_model, parse_material
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.glass_order import catalogue_order
 from dolens.prescriptions.media import canonical

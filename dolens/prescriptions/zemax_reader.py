@@ -24,7 +24,7 @@ from functools import partial
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.mirrors import MIRROR
+from dolens.optics.materials import MIRROR
 from dolens.optics.surfaces.coordinate_break import BREAK as BREAK_KEYS
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.breaks import KIND as BREAK

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.kernels.view import View
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.kernels.rendering import View
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.exit_pupil import (
     ExitPupil,

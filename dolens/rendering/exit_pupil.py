@@ -10,11 +10,10 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial_numbers import Number, ParaxialNumbers
+from dolens.optics.paraxial_rays import Number, ParaxialNumbers
 from dolens.optics.ray_tracing import trace_components, trace_rays
 from dolens.optics.rays import Components, Rays
-from dolens.optics.straight import require_plane_sensor, require_refracting
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 from dolens.optics.trace import trace_surfaces
 from dolens.sensor.pixels import Sensor
 

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels import splatting
-from dolens.optics.backend import cpu_kernels_serve
+from dolens.kernels import rendering
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
-from dolens.optics.ray_tracing import trace_components
+from dolens.optics.ray_tracing import cpu_kernels_serve, trace_components
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.sampling import regular_square, square_to_disc
@@ -118,7 +117,7 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int, fused: bool 
     shape, points = rows.shape[:-1], rows.shape[-1]
     count = math.prod(shape)
     rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
-    return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)
+    return rendering.splat(rows, columns, weight, size).reshape(*shape, size, size)
 
 
 def spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -212,7 +211,7 @@ class _Lookup(torch.autograd.Function):
         ctx.save_for_backward(rows, columns)
         ctx.size, ctx.fused = images.shape[-1], fused
         if fused:
-            return splatting.splat_adjoint(rows, columns, torch.ones_like(rows), images)[2]
+            return rendering.splat_adjoint(rows, columns, torch.ones_like(rows), images)[2]
         return _gather(images, rows, columns)
 
     @staticmethod

@@ -18,7 +18,7 @@ from dolens.diffraction.pixel_psf import (
     with_diffraction_limit,
 )
 from dolens.diffraction.propagation import DiffractionSettings
-from dolens.optics.backend import cpu_kernels_serve
+from dolens.optics.ray_tracing import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem

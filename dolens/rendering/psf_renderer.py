@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.differentiable_geometry import differentiable_exit_pupil
 from dolens.rendering.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number

@@ -14,13 +14,12 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels import rendering
-from dolens.kernels.view import View
-from dolens.optics.backend import say_once, with_chosen_backend
+from dolens.kernels.rendering import View
+from dolens.optics.autograd import replay
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
-from dolens.optics.ray_tracing import trace_components
+from dolens.optics.ray_tracing import say_once, trace_components, with_chosen_backend
 from dolens.optics.rays import Components
-from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
 from dolens.rendering.aperture_edges import (

@@ -16,8 +16,7 @@ from torch.utils.checkpoint import checkpoint
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.rays import Components
-from dolens.optics.straight import require_plane_sensor, require_refracting
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.rendering.psf import bin_rays
 from dolens.sensor.pixels import Sensor

@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.optics.backend import cpu_kernels_serve, with_chosen_backend
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import cpu_kernels_serve, with_chosen_backend
 from dolens.rendering.auto.field_grid import spread_pixels
 from dolens.rendering.auto.plan import Requirements, plan
 from dolens.rendering.auto.probes import grey_levels

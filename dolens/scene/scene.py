@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
-from dolens.optics.paraxial_numbers import Number, ParaxialNumbers
+from dolens.optics.paraxial_rays import Number, ParaxialNumbers
 from dolens.optics.system import OpticalSystem
 
 REFERENCE_WAVELENGTH = 587.5618

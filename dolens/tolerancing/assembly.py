@@ -11,12 +11,11 @@ from torch.func import jacfwd
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
-from dolens.optics.departures import departures
+from dolens.optics.fabrication_errors import fabrication_errors
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
-from dolens.optics.straight import require_plane_sensor
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_plane_sensor
 from dolens.optics.trace import trace_surfaces, trace_to_sensor
 from dolens.tolerancing.sensitivity import check_whole_pupil
 from dolens.tolerancing.tolerances import Tolerances
@@ -112,7 +111,7 @@ def assembled(
         errors: (P,), in the lens's units.
         target: what the line focuses by; None: the sensor stays at its nominal distance.
     """
-    stored = {**departures(lens), **dict(lens.named_parameters())}
+    stored = {**fabrication_errors(lens), **dict(lens.named_parameters())}
     made = dict(values)
     for name, error in zip(tolerances.names, errors.unbind(), strict=True):
         nominal = values.get(name, stored[name])

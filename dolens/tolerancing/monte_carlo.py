@@ -12,11 +12,11 @@ from torch.func import vmap
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.optics.lens_family import LensFamily, shared_rays
+from dolens.optics.ray_tracing import choose_backend
 from dolens.optics.rays import Components, Rays, Status
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tasks import TaskMap
 from dolens.tolerancing.sensitivity import FocusCurves, check_whole_pupil

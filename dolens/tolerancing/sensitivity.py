@@ -13,7 +13,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.tolerancing.tolerances import Tolerances
 
 

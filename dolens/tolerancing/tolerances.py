@@ -18,11 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.optics.departures import departures, names_departures
 from dolens.optics.elements import Element
+from dolens.optics.fabrication_errors import fabrication_errors, names_fabrication_errors
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
-from dolens.optics.parameter_units import unit_of
+from dolens.optics.parameter_names import unit_of
 
 DISTRIBUTIONS = ("uniform", "normal")
 _KEYS = ("half_range", "distribution", "relative")
@@ -105,7 +105,7 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
 
     Args:
         lens: whose parameters they are of, and whose present values are the design.
-        settings: name or pattern, of a parameter or of what `dolens.optics.departures` names
+        settings: name or pattern, of a parameter or of what `dolens.optics.fabrication_errors` names
             (`media.2.index_offset`, `surfaces.*.astigmatism_*`) → half-range (degrees for tilts,
             mm, 1/mm), uniform; or → a mapping of `half_range`, `distribution` (`uniform` or
             `normal`) and `relative` (the half-range is a share of the value); None leaves a pattern
@@ -171,9 +171,9 @@ def _named(lens: Lens, patterns: Sequence[str]) -> dict[str, Tensor]:
     Raises:
         InputError: a pattern matches nothing.
     """
-    stored = [pattern for pattern in patterns if not names_departures(pattern)]
-    others = [pattern for pattern in patterns if names_departures(pattern)]
-    known = departures(lens)
+    stored = [pattern for pattern in patterns if not names_fabrication_errors(pattern)]
+    others = [pattern for pattern in patterns if names_fabrication_errors(pattern)]
+    known = fabrication_errors(lens)
     for pattern in others:
         if not fnmatch.filter(known, pattern):
             near = difflib.get_close_matches(pattern, known, n=3, cutoff=0.4)
@@ -182,7 +182,7 @@ def _named(lens: Lens, patterns: Sequence[str]) -> dict[str, Tensor]:
                 f"allowed: {', '.join(near or known) or 'none'}"
             )
     parameters: dict[str, Tensor] = dict(lens.variables(stored)) if stored else {}
-    return parameters | departures(lens, others)
+    return parameters | fabrication_errors(lens, others)
 
 
 def _row(pattern: str, given: object) -> tuple[float, bool, bool]:

@@ -15,7 +15,7 @@ from dolens.experiments.camera.lens_least_squares import LensLeastSquares
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import to_file_units
+from dolens.optics.parameter_names import to_file_units
 from dolens.optimize.variables import DesignVariables
 from dolens.tasks import stage as named_stage
 

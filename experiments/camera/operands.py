@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.state_names import values_in_state
+from dolens.optics.parameter_names import values_in_state
 from dolens.optimize.operand_values import OperandModel, evaluate_operands
 from dolens.optimize.operands import UnreachableField, check_operand_fields, operand
 from dolens.optimize.variables import DesignVariables

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.experiments.design.tables import SpotTable, spot_metrics, spot_table
-from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings

@@ -13,7 +13,7 @@ from dolens.alignment.moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.checks import check_count, check_finite, check_positive
-from dolens.optics.parameter_units import unit_factors
+from dolens.optics.parameter_names import unit_factors
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ from dolens.experiments.poses.chart_simulation import (
 from dolens.experiments.settings import PupilRays
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from dolens.optics.straight import require_plane_sensor
+from dolens.optics.system import require_plane_sensor
 from dolens.plotting.layout import lens_title
 from dolens.tasks import stage as named_stage
 from dolens.tolerancing import tolerances_from

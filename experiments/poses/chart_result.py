@@ -12,7 +12,7 @@ from dolens.alignment.chart_model import BLUR
 from dolens.experiments.poses.chart_restoration import ARMS, Judged
 from dolens.experiments.poses.results import error_statistics
 from dolens.experiments.tables import Row
-from dolens.optics.parameter_units import DEGREE, unit_of
+from dolens.optics.parameter_names import DEGREE, unit_of
 
 # An interval of 95 % of a normal distribution.
 _WITHIN = 1.959964

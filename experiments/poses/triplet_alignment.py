@@ -31,7 +31,7 @@ from dolens.experiments.poses.alignment_settings import Detector, Misalignments
 from dolens.experiments.settings import PupilRays, Spots
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_units import DEGREE, unit_of
+from dolens.optics.parameter_names import DEGREE, unit_of
 from dolens.plotting.layout import lens_title
 from dolens.tasks import stage as named_stage
 

@@ -14,7 +14,7 @@ from dolens.experiments.checks import (
     numbers_of,
 )
 from dolens.experiments.speed.renders import Subject
-from dolens.optics.parameter_units import to_lens_units
+from dolens.optics.parameter_names import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor

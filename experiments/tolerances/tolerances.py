@@ -26,7 +26,7 @@ from dolens.experiments.tolerances.tables import (
     sensitivity_rows,
 )
 from dolens.experiments.workers import workers_of
-from dolens.optics.departures import names_departures
+from dolens.optics.fabrication_errors import names_fabrication_errors
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.tasks import stage as named_stage
@@ -124,7 +124,7 @@ class TolerancesModule(Analysis):
         self.spots = spots
         self.weights = self._weights(weights)
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
-        for name in filter(names_departures, self.tolerances.names):
+        for name in filter(names_fabrication_errors, self.tolerances.names):
             raise InputError(
                 f"tolerances.{name}: allowed here: parameters of the lens, which rays have "
                 "derivatives by; a camera's made lenses may have this error"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dolens.optics.model_glass import normal_partial_dispersion
+from dolens.optics.dispersion import normal_partial_dispersion
 
 # nm, as rounded there: C, d, F, g.
 _C, _D, _F, _G = 656.3, 587.6, 486.1, 435.8

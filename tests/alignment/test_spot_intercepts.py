@@ -19,7 +19,7 @@ from dolens.alignment.spot_moments import (
     moment_model,
 )
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.optics import backend
+from dolens.optics import ray_tracing
 from dolens.prescriptions import lens_from_prescription
 
 FIELDS = ((0.0, 0.0), (0.0, 14.0), (14.0, -6.0))
@@ -224,8 +224,8 @@ def test_the_lens_is_left_as_it_was_and_says_what_traces_it(triplet, spots, capl
     lens, asked = copy.deepcopy(triplet), []
     edges = [surface.aperture for surface in lens.surfaces.values()]
     # A surface of the user's own has no kernel.
-    monkeypatch.setattr(backend, "unsupported", lambda _: asked.append(1) or "of no kernel")
-    backend.say_once.cache_clear()
+    monkeypatch.setattr(ray_tracing, "unsupported", lambda _: asked.append(1) or "of no kernel")
+    ray_tracing.say_once.cache_clear()
     with caplog.at_level(logging.INFO, "dolens.kernels"):
         model = moment_model(lens, spots, NAMES)
     assert isinstance(model.intercepts, ReferenceIntercepts) and asked

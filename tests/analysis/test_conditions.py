@@ -15,7 +15,7 @@ from dolens.analysis.conditions import (
     wavelength_interval,
 )
 from dolens.errors import InputError
-from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.field_and_aperture import with_aperture
 from dolens.prescriptions import lens_from_prescription
 
 

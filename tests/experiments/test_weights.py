@@ -27,7 +27,7 @@ from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import lens_overview, prepared_lens
 from dolens.lens_page.sections import PageSections
 from dolens.lens_search.form_report import lens_sensitivity
-from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.fields import Fields
 from dolens.optimize import DesignVariables, MeritSettings
 

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import pytest
 from numba.core import config
 
-from dolens.kernels.cpu import compiler, kernel_files, machine_code
+from dolens.kernels.cpu import compiler, kernel_files
 from dolens.kernels.cpu.plane import clip
 from dolens.tasks import listening
 
@@ -167,7 +167,7 @@ def test_a_kernel_in_the_place_of_another_is_compiled_anew(kept, forget, caplog,
 
 
 def test_machine_code_that_cannot_be_loaded_is_compiled_anew(kept, forget, caplog):
-    forget.setattr(machine_code, "load", lambda kernel: (_ for _ in ()).throw(RuntimeError("no")))
+    forget.setattr(kernel_files, "load", lambda kernel: (_ for _ in ()).throw(RuntimeError("no")))
     start_again(forget)
     assert compiler.compile_block(clip, "float32") != 0
     assert "made anew: no" in caplog.text

@@ -11,7 +11,7 @@ import torch
 from dolens import InputError, Rays, load_lens
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Kind
-from dolens.optics.backend import without_triton
+from dolens.optics.ray_tracing import without_triton
 from dolens.optics.surfaces import EvenAsphere, XYPolynomial, ZernikeStandard
 from tests.kernels.own_surface.paraboloid import Paraboloid
 
@@ -133,10 +133,9 @@ def test_the_kernels_compile_and_keep_their_precision(name, real):
 
     The interpreter could not tell: it has no types but NumPy's.
     """
-    from dolens.kernels.cuda.adjoint import adjoint_kernel
-    from dolens.kernels.cuda.forward import forward_kernel
     from dolens.kernels.cuda.jacobian import jacobian_kernel
     from dolens.kernels.cuda.launching import ADJOINT_BLOCK, FORWARD_BLOCK, JACOBIAN_BLOCK
+    from dolens.kernels.cuda.trace import adjoint_kernel, forward_kernel
 
     forward = compile_for(forward_kernel, real, *LENSES[name], FORWARD_BLOCK, ("which",))
     absent = ("which", "of_direction", "of_path")

@@ -7,7 +7,7 @@ import torch
 
 from dolens import InputError, Rays
 from dolens.kernels.cpu.compiler import source_of
-from dolens.kernels.cpu.scalars import given_by_scalars
+from dolens.kernels.cpu.explicit import given_by_scalars
 from dolens.kernels.surface_kernel import SurfaceKernel, kernels_of
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.packing import unsupported

@@ -9,7 +9,7 @@ import torch
 
 from dolens import Rays, load_lens
 from dolens.optics.surfaces import register_surface, unregister_surface
-from dolens.optics.surfaces.spline_basis import clamped_knots
+from dolens.optics.surfaces.b_spline import clamped_knots
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.kernels.own_surface.paraboloid import Paraboloid
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
-from dolens.optics.surfaces.zernike_terms import fringe, noll
+from dolens.optics.surfaces.zernike import fringe, noll
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.interpolate import BSpline as SciPySpline
 
-from dolens.optics.surfaces.spline_basis import clamped_knots
+from dolens.optics.surfaces.b_spline import clamped_knots
 
 F64 = torch.float64
 # Knots (mm) of every kind that is allowed; "repeated" holds a double, a triple and a quadruple.

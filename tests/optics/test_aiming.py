@@ -7,8 +7,7 @@ import torch
 import yaml
 
 from dolens import InputError, Status, load_lens
-from dolens.optics.aiming import aim
-from dolens.optics.launching import field_line, launch
+from dolens.optics.aiming import aim, field_line, launch
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
 

@@ -10,8 +10,7 @@ from torch.func import grad, jacfwd, jvp, vmap
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dolens.optics.surfaces import BSpline
-from dolens.optics.surfaces.b_spline import spline_sag
-from dolens.optics.surfaces.spline_basis import clamped_knots, cubic_basis
+from dolens.optics.surfaces.b_spline import clamped_knots, cubic_basis, spline_sag
 from tests.optics.spline_samples import (
     F64,
     KNOTS,

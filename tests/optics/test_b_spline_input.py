@@ -6,7 +6,7 @@ import pytest
 
 from dolens import InputError
 from dolens.optics.surfaces import BSpline
-from dolens.optics.surfaces.spline_basis import clamped_knots
+from dolens.optics.surfaces.b_spline import clamped_knots
 from tests.optics.spline_samples import KNOTS
 
 FOUR = [[0.0] * 4 for _ in range(4)]

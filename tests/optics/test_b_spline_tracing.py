@@ -9,9 +9,8 @@ import torch
 
 from dolens import Rays, Status
 from dolens.optics.surfaces import BSpline, Conic, XYPolynomial
-from dolens.optics.surfaces.b_spline import spline_sag
+from dolens.optics.surfaces.b_spline import clamped_knots, spline_sag
 from dolens.optics.surfaces.refraction import PlaneRay
-from dolens.optics.surfaces.spline_basis import clamped_knots
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.spline_samples import F64, KNOTS, marsden, polynomial_spline, random
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, load_lens
-from dolens.optics.departures import departures
+from dolens.optics.fabrication_errors import fabrication_errors
 from dolens.optics.paraxial import first_order
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.surfaces.zernike import ZernikeFringe
 from dolens.prescriptions.build import lens_from_prescription
@@ -125,7 +125,7 @@ def test_astigmatism_is_added_to_the_sag(shape):
 def test_rays_have_the_derivatives_of_departures(backend):
     lens = singlet()
     lens.requires_grad_(False)
-    names = list(departures(lens))
+    names = list(fabrication_errors(lens))
     assert names == [
         *("surfaces.1.astigmatism_0", "surfaces.1.astigmatism_45"),
         *("surfaces.2.astigmatism_0", "surfaces.2.astigmatism_45"),
@@ -149,7 +149,7 @@ def test_rays_have_the_derivatives_of_departures(backend):
 
 def test_what_is_no_glass_has_no_index_offset(root):
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml")
-    media = [name for name in departures(lens) if name.startswith("media")]
+    media = [name for name in fabrication_errors(lens) if name.startswith("media")]
     assert media == ["media.1.index_offset", "media.3.index_offset", "media.5.index_offset"]
     with pytest.raises(InputError, match=r"no parameter 'media\.2\.index_offset'"):
         lens.system({"media.2.index_offset": number(1e-3)})
@@ -157,7 +157,7 @@ def test_what_is_no_glass_has_no_index_offset(root):
 
 def test_light_that_a_mirror_returns_is_in_the_same_glass(root):
     lens = load_lens(root / "conf/lens/published/mangin_reflex_us3507556_e1.yaml")
-    names = [name for name in departures(lens) if name.startswith("media")]
+    names = [name for name in fabrication_errors(lens) if name.startswith("media")]
     values = {name: number(1e-4 * (i + 1)) for i, name in enumerate(names)}
     system = lens.system(values)
     for mirror in system.mirrors:

@@ -5,8 +5,7 @@ import torch
 
 import dolens
 from dolens import Rays
-from dolens.optics.family_parts import intercept_parts, jacobian_parts
-from dolens.optics.lens_family import LensFamily, shared_rays
+from dolens.optics.lens_family import LensFamily, intercept_parts, jacobian_parts, shared_rays
 from dolens.tolerancing.tolerances import with_glass_elements
 
 LENSES, RAYS = 7, 50

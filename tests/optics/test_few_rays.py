@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dolens
-from dolens.optics.backend import FEW, is_few
+from dolens.optics.ray_tracing import FEW, is_few
 
 
 @pytest.fixture

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.optics.glass_catalog import find_glass
-from dolens.optics.glass_tables import FURTHER, MAKERS, table
+from dolens.optics.glass_catalog import FURTHER, MAKERS, find_glass, table
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
 
 LINES = {"C": 656.2725, "d": 587.5618, "e": 546.0740, "F": 486.1327, "g": 435.8343}

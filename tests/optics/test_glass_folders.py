@@ -3,8 +3,7 @@
 import pytest
 
 from dolens import InputError, load_lens, save_lens
-from dolens.optics.glass_catalog import catalogues, find_glass
-from dolens.optics.glass_folders import glass_folders
+from dolens.optics.glass_catalog import catalogues, find_glass, glass_folders
 
 # A glass of constant index, and another by a maker's name with the maker's own coefficients.
 OWN = "NM GLASS1 5 0 1.7 0\nED 12.5 0 0 0 0\nCD 1.7 0 0\nTD 1E-6 0 0 0 0 0 20\nLD 0.4 0.7\n"

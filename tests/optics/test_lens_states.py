@@ -7,7 +7,7 @@ import torch
 
 from dolens import InputError, Rays
 from dolens.optics.lens_states import values_there
-from dolens.optics.parameter_units import to_file_units
+from dolens.optics.parameter_names import to_file_units
 from dolens.prescriptions import lens_from_prescription
 
 SHARED, OWN = "surfaces.1.curvature", "states.tele.thicknesses.2"

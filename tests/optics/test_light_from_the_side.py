@@ -9,7 +9,7 @@ import torch
 from dolens import InputError, Rays, Status
 from dolens.analysis.field_curves import parabasal_rays
 from dolens.diffraction.entrance_beam import ObjectPoints
-from dolens.optics.launching import field_line
+from dolens.optics.aiming import field_line
 from dolens.plotting.layout import layout_drawing
 from dolens.prescriptions.build import lens_from_prescription
 

@@ -8,7 +8,7 @@ import torch
 from dolens import Rays, Status
 from dolens.errors import InputError
 from dolens.optics.jacobian import normal_equations, ray_jacobian
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.optics.ray_tracing import trace_rays
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.kernels.trace_cases import LENSES, bundle

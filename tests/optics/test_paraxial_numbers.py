@@ -7,9 +7,8 @@ import pytest
 import torch
 import yaml
 
-from dolens.optics.paraxial import chief_ray_magnification, exit_pupil
-from dolens.optics.paraxial_numbers import ParaxialNumbers
-from dolens.optics.paraxial_recurrence import TwoRays, through_surfaces
+from dolens.optics.paraxial import TwoRays, chief_ray_magnification, exit_pupil, through_surfaces
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.prescriptions import lens_from_prescription
 
 LENSES = ["cooke_triplet", "double_gauss", "large_fov_doublet", "nikon", "wavefront_coding"]

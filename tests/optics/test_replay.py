@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dolens.optics.replay import replay
+from dolens.optics.autograd import replay
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor

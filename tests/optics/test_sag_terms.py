@@ -20,9 +20,8 @@ from dolens.optics.surfaces import (
     ZernikeFringe,
     ZernikeStandard,
 )
-from dolens.optics.surfaces.forbes_basis import q_bfs, to_auxiliary
-from dolens.optics.surfaces.jacobi import jacobi
-from dolens.optics.surfaces.zernike_terms import fringe, noll
+from dolens.optics.surfaces.forbes import q_bfs, to_auxiliary
+from dolens.optics.surfaces.zernike import fringe, jacobi, noll
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.optics.exact_sags import mp, q_bfs_polynomial
 

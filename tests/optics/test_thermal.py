@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from dolens import InputError
+from dolens.optics.glass import Environment, air_index
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.materials import index_model, parse_material
-from dolens.optics.thermal import Environment, air_index
 
 # Schott's data sheet of N-BK7 (2014): Δn/ΔT in 1e-6/K, relative and absolute, at 1060 nm, e and g.
 LINES = (1060.0, 546.074, 435.8343)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens, save_lens
+from dolens.optics.glass import Environment
 from dolens.optics.glass_catalog import find_glass
-from dolens.optics.thermal import Environment
 from dolens.prescriptions import lens_from_prescription, prescription_of
 
 WAVE = 587.5618

@@ -7,7 +7,7 @@ import torch
 
 from dolens import InputError
 from dolens.alignment.pose import Pose
-from dolens.optics.parameter_units import file_value, to_file_units, to_lens_units, unit_of
+from dolens.optics.parameter_names import file_value, to_file_units, to_lens_units, unit_of
 from dolens.optimize import DesignVariables
 from dolens.optimize.variables import start_values
 from dolens.prescriptions import lens_from_prescription, prescription_of

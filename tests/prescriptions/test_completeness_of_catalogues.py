@@ -10,8 +10,8 @@ import torch
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.optics.agf import AgfEntry, internal_transmittance, parse_agf, read_entry
-from dolens.optics.glass_folders import user_glass
-from dolens.optics.thermal import Environment
+from dolens.optics.glass import Environment
+from dolens.optics.glass_catalog import user_glass
 from tests.optics.test_agf import CATALOGUE
 from tests.prescriptions.judged_keys import changed_text, text_with_commas
 

@@ -7,7 +7,7 @@ import pytest
 
 from dolens import InputError, load_lens
 from dolens.errors import check_keys
-from dolens.optics.glass_folders import glass_folders
+from dolens.optics.glass_catalog import glass_folders
 from dolens.prescriptions.files import find_lens
 from dolens.prescriptions.yaml_text import plain_values
 from scripts.fuzz_lens_files import outcome

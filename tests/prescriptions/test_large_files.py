@@ -5,7 +5,7 @@ explains.
 import pytest
 
 from dolens import InputError, load_lens
-from dolens.optics.glass_folders import user_entries
+from dolens.optics.glass_catalog import user_entries
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.prescriptions.files import read_lens_file
 from scripts.fuzz_lens_files import outcome

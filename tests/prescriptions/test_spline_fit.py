@@ -9,7 +9,7 @@ import torch
 from scipy.interpolate import BSpline as SciPySpline
 
 from dolens import InputError, load_lens, save_lens
-from dolens.optics.surfaces.spline_basis import clamped_knots
+from dolens.optics.surfaces.b_spline import clamped_knots
 from dolens.prescriptions import fit_b_spline, lens_from_prescription, prescription_of
 
 KNOTS_X = clamped_knots(5.0, 12)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens, save_lens
+from dolens.optics.glass import Environment
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
-from dolens.optics.thermal import Environment
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_reader import prescription_from_zemax

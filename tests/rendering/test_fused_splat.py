@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.kernels import splatting
+from dolens.kernels import rendering
 from dolens.rendering.psf import axial_point_spread_functions, splat
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -108,4 +108,4 @@ def test_second_derivatives_are_an_error():
 def test_the_operator_is_what_pytorch_asks_of_one():
     given = [t.reshape(2, 10).requires_grad_() for t in points(20, 9)]
     tests = ("test_schema", "test_faketensor", "test_autograd_registration")
-    torch.library.opcheck(splatting.splat, (*given, 9), test_utils=tests)
+    torch.library.opcheck(rendering.splat, (*given, 9), test_utils=tests)

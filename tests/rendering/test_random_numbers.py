@@ -46,7 +46,7 @@ def test_words_are_the_published_hash(pixel, sample, seed):
 def test_kernels_have_the_same_bits():
     import numpy as np
 
-    from dolens.kernels.cpu.rendering import random_numbers as kernel
+    from dolens.kernels.cpu.rendering import pixel_samples as kernel
 
     for pixel, sample, seed in COUNTERS:
         counters = (np.uint32(c) for c in (pixel, sample, seed & MASK, seed >> 32))

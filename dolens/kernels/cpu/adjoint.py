@@ -23,34 +23,32 @@ from dolens.kernels.cpu.compiler import (
 )
 from dolens.kernels.cpu.forward import real_at, streams
 from dolens.kernels.cpu.layout import (
+    ADJOINT,
+    BEFORE,
     BLOCK,
+    CHANGE_AXES,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
     ENDED,
+    KIND,
+    LENGTH,
+    LENS_AXES,
     OF_FRONT,
     OF_RECORD,
     OF_SHAPE,
+    OFFSET,
     PATH,
+    POSE,
+    SHAPE,
     STATE,
+    STENCIL,
     STENCIL_PLACE,
     UNBOUNDED,
     VIGNETTED,
     L,
     X,
     Z,
-)
-from dolens.kernels.cpu.records import (
-    ADJOINT,
-    BEFORE,
-    CHANGE_AXES,
-    CODE_ROW,
-    COLUMNS,
-    COUNT,
-    KIND,
-    LENGTH,
-    LENS_AXES,
-    OFFSET,
-    POSE,
-    SHAPE,
-    STENCIL,
 )
 
 

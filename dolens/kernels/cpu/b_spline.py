@@ -17,6 +17,9 @@ from dolens.kernels.cpu.compiler import OPTIONS, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
     FURTHER,
     MARGIN,
     OF_SAG,
@@ -29,13 +32,13 @@ from dolens.kernels.cpu.layout import (
     SAG_XX,
     SAG_XY,
     SAG_YY,
+    SHAPE,
     SLOPE_X,
     SLOPE_Y,
     STENCIL_IS_HERE,
     STENCIL_PLACE,
     UNBOUNDED,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, SHAPE
 
 MORE_KNOTS = 4  # than coefficients
 # Work rows: the knots about x and about y, and the coefficients, four rows of four; then the first

@@ -9,7 +9,7 @@ from typing import Any
 
 from numba import njit
 
-from dolens.kernels.cpu.scalars import OPTIONS, given_by_scalars
+from dolens.kernels.cpu.explicit import OPTIONS, given_by_scalars
 from dolens.kernels.limits import TINY
 
 

@@ -1,7 +1,9 @@
 """Kernels are compiled to C functions that a cache on disk keeps; intrinsics join them.
 
 A kernel is a function of pointers, made by a factory: a function of a real type that returns the
-kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.
+kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.  The
+kernels of a surface or of a law of deflection are block functions, given by their factories.
+
 """
 
 import ctypes
@@ -9,8 +11,9 @@ import hashlib
 import inspect
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +25,7 @@ from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
-from dolens.kernels.cpu import machine_code
+from dolens.kernels.cpu import kernel_files
 from dolens.kernels.cpu.kernel_files import KernelFiles
 from dolens.tasks import stage
 
@@ -181,7 +184,7 @@ def _compiled(factory: Factory, real: str, signature: Any) -> int:
                     kernel = _made(factory, real, signature)
                     address = kernel.address or 0
                     if files:
-                        files.write(machine_code.taken_from(kernel))
+                        files.write(kernel_files.taken_from(kernel))
             _kernels[factory, real] = address
     return address
 
@@ -189,7 +192,7 @@ def _compiled(factory: Factory, real: str, signature: Any) -> int:
 def _files(factory: Factory, real: str) -> KernelFiles | None:
     try:
         source = (*source_of(factory), real)
-        return KernelFiles(f"{factory.__name__}-{real}", stamp(), source, machine_code.target())
+        return KernelFiles(f"{factory.__name__}-{real}", stamp(), source, kernel_files.target())
     except RuntimeError as error:  # no source, or no home folder
         logger.warning("compiled kernels cannot be kept for the next start: %s", error)
         return None
@@ -199,7 +202,7 @@ def _read(files: KernelFiles) -> int | None:
     """Return the address of a kernel from disk; None where there is none that can be loaded."""
     found = files.read()
     try:
-        return None if found is None else machine_code.load(found)
+        return None if found is None else kernel_files.load(found)
     except RuntimeError as error:
         logger.warning("a compiled kernel on disk is made anew: %s (%s)", error, files.path)
         return None
@@ -265,3 +268,56 @@ def _wide_vectors() -> Iterator[None]:
         yield
     finally:
         config.CPU_FEATURES = None
+
+
+def _none(row: Sequence[int]) -> int:
+    """Ask for no work rows."""
+    return 0
+
+
+@dataclass(frozen=True)
+class LawFunctions:
+    """A law of deflection has these block functions.
+
+    Attributes:
+        forward: carries a block of rays on a surface through the deflection.
+        adjoint: takes cotangents from behind it to its front.
+        phase: of a phase: φ and its gradient; see `deflection`.
+        phase_hessian: φ, its gradient and its second derivatives.
+        phase_parameters: cotangents of the law's numbers from those of φ and its gradient.
+    """
+
+    forward: Factory
+    adjoint: Factory
+    phase: Factory | None = None
+    phase_hessian: Factory | None = None
+    phase_parameters: Factory | None = None
+
+
+@dataclass(frozen=True)
+class StepFunctions:
+    """A step has these block functions.
+
+    Attributes:
+        forward: carries a block of rays through the step.
+        adjoint: takes cotangents from behind the step to its front.
+        sag: of a surface given by its sag: sag, slopes and margin; see `explicit`.
+        sag_hessian: slopes and second derivatives of the sag.
+        parameters: cotangents of the shape's numbers from those of sag and slopes.
+        starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
+            starts; else it starts on the vertex plane.
+        stencil: a ray depends on 4×4 neighbours among the shape's last COUNT·COLUMNS numbers only,
+            and has cotangents for these alone.
+        scratch: work rows of the shape's own, by its row of codes.
+        numbers: how many a shape must have; None: any.
+    """
+
+    forward: Factory
+    adjoint: Factory
+    sag: Factory | None = None
+    sag_hessian: Factory | None = None
+    parameters: Factory | None = None
+    starts_on_conic: bool = False
+    stencil: bool = False
+    scratch: Callable[[Sequence[int]], int] = _none
+    numbers: int | None = None

@@ -11,12 +11,14 @@ from typing import Any
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import OPTIONS
-from dolens.kernels.cpu.functions import StepFunctions
+from dolens.kernels.cpu.compiler import OPTIONS, StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    EDGE,
     INDEX,
     INVERSE_INDEX,
+    LIMIT,
     OF_BEHIND,
     OF_FRONT,
     OF_SECOND,
@@ -24,7 +26,14 @@ from dolens.kernels.cpu.layout import (
     OF_SHIFT,
     PATH,
     RATIO,
+    REFRACTS,
+    SENSE,
+    SENSE_BEHIND,
+    SHAPE,
+    SHIFT,
+    SHORT_RECORD,
     STATE,
+    TAG,
     TRAVELLED,
     UNBOUNDED,
     WORK_SIZE,
@@ -34,18 +43,6 @@ from dolens.kernels.cpu.layout import (
     X,
     Y,
     Z,
-)
-from dolens.kernels.cpu.records import (
-    CODE_ROW,
-    EDGE,
-    LIMIT,
-    REFRACTS,
-    SENSE,
-    SENSE_BEHIND,
-    SHAPE,
-    SHIFT,
-    SHORT_RECORD,
-    TAG,
 )
 from dolens.kernels.limits import GRAZING
 

@@ -15,6 +15,8 @@ from dolens.kernels.cpu.compiler import OPTIONS, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COUNT,
     MARGIN,
     OF_SAG,
     OF_SECOND,
@@ -28,12 +30,13 @@ from dolens.kernels.cpu.layout import (
     SAG_XX,
     SAG_XY,
     SAG_YY,
+    SHAPE,
+    SHORT_RECORD,
     SLOPE_X,
     SLOPE_Y,
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COUNT, SHAPE, SHORT_RECORD
 
 # Work rows: q, H, H' and H''/2; for the cotangents, powers of q and the weight of the slope.
 Q, H, H_SLOPE, H_SECOND, *_ = OWN

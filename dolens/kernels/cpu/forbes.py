@@ -27,6 +27,9 @@ from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.jacobi import jacobi
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COLUMNS,
+    DEGREE,
     FURTHER,
     MARGIN,
     OF_SAG,
@@ -40,11 +43,11 @@ from dolens.kernels.cpu.layout import (
     SAG_XX,
     SAG_XY,
     SAG_YY,
+    SHAPE,
     SLOPE_X,
     SLOPE_Y,
     UNBOUNDED,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, DEGREE, SHAPE
 
 # Work rows: q; T with two derivatives; the recurrence.
 ROWS = 4 + polynomials.ROWS

@@ -20,16 +20,27 @@ from dolens.kernels.cpu.compiler import (
     shifted,
 )
 from dolens.kernels.cpu.layout import (
+    AFTER,
+    BEFORE,
     BLOCK,
+    CODE_ROW,
     ENDED,
+    FORWARD,
+    HOLE,
     INDEX,
     INVERSE_INDEX,
+    OFFSET,
+    OUTLINE,
     PATH,
     PER_RADIAN,
     RATIO,
+    RECTANGLE,
     STATE,
+    STATUS_BITS,
+    STATUS_MASK,
     UNBOUNDED,
     VIGNETTED,
+    WAVE,
     WORK_SIZE,
     L,
     M,
@@ -37,19 +48,6 @@ from dolens.kernels.cpu.layout import (
     X,
     Y,
     Z,
-)
-from dolens.kernels.cpu.records import (
-    AFTER,
-    BEFORE,
-    CODE_ROW,
-    FORWARD,
-    HOLE,
-    OFFSET,
-    OUTLINE,
-    RECTANGLE,
-    STATUS_BITS,
-    STATUS_MASK,
-    WAVE,
 )
 from dolens.kernels.limits import FARTHEST, LONGEST
 

@@ -22,6 +22,10 @@ from dolens.kernels.cpu.even_asphere import (
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
+    DEGREE,
     FURTHER,
     MARGIN,
     POINT_X,
@@ -34,7 +38,6 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     UNBOUNDED,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, DEGREE
 
 # Behind the even asphere's numbers: spacings, decentre, nodes.
 NODES = 4

@@ -8,19 +8,23 @@ from collections.abc import Callable
 
 from numba import carray, types
 
-from dolens.kernels.cpu.compiler import shifted
-from dolens.kernels.cpu.functions import LawFunctions
+from dolens.kernels.cpu.compiler import LawFunctions, shifted
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
     ENDED,
     INDEX,
     INVERSE_INDEX,
+    NUMBERS,
     OF_BEHIND,
     OF_FRONT,
     OF_RECORD,
     OF_SHIFT,
     PATH,
     RATIO,
+    SENSE,
+    SHAPE,
+    SHORT_RECORD,
     STATE,
     TRAVELLED,
     UNBOUNDED,
@@ -33,7 +37,6 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.cpu.records import CODE_ROW, NUMBERS, SENSE, SHAPE, SHORT_RECORD
 from dolens.kernels.limits import GRAZING
 
 

@@ -1,4 +1,4 @@
-"""Jacobi polynomials of a block of rays; see `dolens.optics.surfaces.jacobi`."""
+"""Jacobi polynomials of a block of rays; see `dolens.optics.surfaces.zernike`."""
 
 from functools import cache
 from typing import Any

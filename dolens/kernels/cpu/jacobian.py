@@ -28,25 +28,23 @@ from dolens.kernels.cpu.compiler import (
 )
 from dolens.kernels.cpu.forward import real_at, streams
 from dolens.kernels.cpu.layout import (
-    BLOCK,
-    ENDED,
-    OF_FRONT,
-    OF_SHAPE,
-    STATE,
-    STENCIL_PLACE,
-    UNBOUNDED,
-    VIGNETTED,
-)
-from dolens.kernels.cpu.records import (
     ADJOINT,
     BEFORE,
+    BLOCK,
     CODE_ROW,
     COLUMNS,
     COUNT,
+    ENDED,
     LENGTH,
+    OF_FRONT,
+    OF_SHAPE,
     OFFSET,
     SAG_AND_SLOPES,
+    STATE,
     STENCIL,
+    STENCIL_PLACE,
+    UNBOUNDED,
+    VIGNETTED,
 )
 
 # Rays of a block that must pass for it to be swept as it is: tracing some rays again costs about as

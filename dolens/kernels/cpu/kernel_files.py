@@ -1,4 +1,4 @@
-"""Compiled kernels are kept in files of the user's cache folder, one file a kernel.
+"""Compiled kernels are kept as machine code in the user's cache folder, one file a kernel.
 
 A file's name is a digest of all that decides its content: the kernels' sources, Python, Numba and
 LLVM, and the processor with its features.  So machines that share a home folder do not meet in a
@@ -6,10 +6,11 @@ file, and processes that compile at the same time write the same content: each w
 own and renames it, and the last one stays.
 
 A file holds machine code and the name of its function, behind a digest of both and of what the
-kernel was made from; no Python object is in it, and nothing is unpickled.  The digest finds damage,
-and files that were exchanged.  Machine code is executed, of course, so a file counts only if this
-user (or root) owns it and nobody else may write to it; what a user runs can write such files too,
-as it can write the user's Python packages.
+kernel was made from; no Python object is in it, and nothing is unpickled, as it is by Numba's own
+cache.  The digest finds damage, and files that were exchanged.  Machine code is executed, of
+course, so a file counts only if this user (or root) owns it and nobody else may write to it; what a
+user runs can write such files too, as it can write the user's Python packages.
+
 """
 
 import hashlib
@@ -19,14 +20,68 @@ import platform
 import stat
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite
 import numba
-from numba.core import config
+from llvmlite import binding
+from numba.core import config, registry
+from numba.core.ccallback import CFunc
+from numba.core.runtime import rtsys
 
 from dolens.files import delete_old, user_cache_folder, write_whole
-from dolens.kernels.cpu.machine_code import MachineCode
+
+# Machine code lives as long as the engine that loaded it, and kernels as long as the process.
+_engines: list[binding.ExecutionEngine] = []
+
+
+class MachineCode(NamedTuple):
+    """A kernel as an object file.
+
+    Attributes:
+        function: the symbol of the C function.
+        code: the content of the object file, in the system's format.
+    """
+
+    function: str
+    code: bytes
+
+
+def target() -> tuple:
+    """Return what decides the machine code: the system, the processor and its features."""
+    return registry.cpu_target.target_context.codegen().magic_tuple()
+
+
+def taken_from(compiled: CFunc) -> MachineCode:
+    """Return the machine code of a compiled function."""
+    library: Any = compiled._library  # type: ignore[attr-defined]
+    _, _, (code, _) = library.serialize_using_object_code()
+    return MachineCode(compiled.native_name, code)
+
+
+def load(kernel: MachineCode) -> int:
+    """Load machine code for the rest of the process; return the function's address.
+
+    Each kernel has an engine of its own: names of one are not seen by another.
+
+    Raises:
+        RuntimeError: it is not for this system, or has no such function.
+    """
+    context = registry.cpu_target.target_context
+    rtsys.initialize(context)  # symbols of Numba's runtime
+    triple = target()[0]
+    module = binding.parse_assembly("")
+    module.triple = triple
+    machine = binding.Target.from_triple(triple).create_target_machine(jit=True)
+    engine = binding.create_mcjit_compiler(module, machine)
+    engine.add_object_file(binding.ObjectFileRef.from_data(kernel.code))
+    engine.finalize_object()
+    address = engine.get_function_address(kernel.function)
+    if not address:
+        raise RuntimeError(f"no function {kernel.function}")
+    _engines.append(engine)
+    return address
+
 
 logger = logging.getLogger("dolens.kernels")
 

@@ -2,26 +2,33 @@
 
 Tables, rays and what is found have a leading dimension of L lenses.  Whatever all lenses share may
 be expanded to it (a stride of zero): it is read where it is.
+
+The driver of many lenses runs another driver for one lens after the other.
+
+Lenses of one structure share the codes of their steps, so that they differ in addresses only: those
+of their numbers, of their indices, of their rays and of what is written.  Each moves on by a fixed
+number of bytes from one lens to the next.
+
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numba import carray, types
 from torch import Tensor
 
-from dolens.kernels.cpu import jobs
+from dolens.kernels.cpu import compiler, jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.backend import chunk_size
-from dolens.kernels.cpu.derivatives import Derivatives, rays_of_a_chunk
+from dolens.kernels.cpu.compiler import call_driver, int64_at
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.jacobian import jacobian_driver
-from dolens.kernels.cpu.layout import BLOCK
-from dolens.kernels.cpu.many_lenses import run_lenses
-from dolens.kernels.cpu.normal_equations import normal_equations_driver
-from dolens.kernels.cpu.program import Program
-from dolens.kernels.table import SurfaceTable
-from dolens.kernels.variable_map import VariableMap
+from dolens.kernels.cpu.layout import BLOCK, UNBOUNDED
+from dolens.kernels.cpu.least_squares import normal_equations_driver
+from dolens.kernels.cpu.program import Derivatives, Program, rays_of_a_chunk
+from dolens.kernels.table import SurfaceTable, VariableMap
 
 # Fewer rays than these, of all lenses, are done sooner than another thread is woken.
 _SMALL_TRACE, _SMALL_DERIVATIVES = 1 << 13, 1 << 10
@@ -139,7 +146,7 @@ def ray_jacobians(
     Args:
         table: as in `trace`.
         variables: P of them, of E entries, the same for all lenses.
-        outputs: K names of `dolens.kernels.variable_map.OUTPUT_ROWS`.
+        outputs: K names of `dolens.kernels.table.OUTPUT_ROWS`.
         rays: as in `trace`.
         weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
         index_derivatives: (L, entries, wavelengths), float64, for `variables.indices`.
@@ -298,3 +305,52 @@ def _weights_of(
     if index_derivatives is not None:
         by_lens[jobs.INDEX_WEIGHTS] = index_derivatives
     return by_lens
+
+
+def lenses_driver(real: types.Type) -> Callable[..., None]:
+    """Compile the driver that runs the inner driver over all its pieces for lenses `first` to
+    `last`.
+    """
+
+    def kernel(job_, first, last):  # noqa: ANN001, ANN202
+        job = carray(job_, jobs.LENGTH)
+        pairs = carray(int64_at(job[jobs.STRIDES]), UNBOUNDED)
+        for lens in range(first, last):
+            for i in range(job[jobs.STRIDE_PAIRS]):
+                job[pairs[2 * i]] += lens * pairs[2 * i + 1]
+            call_driver(job[jobs.INNER_DRIVER], job_, 0, job[jobs.INNER_PIECES])
+            for i in range(job[jobs.STRIDE_PAIRS]):
+                job[pairs[2 * i]] -= lens * pairs[2 * i + 1]
+
+    return kernel
+
+
+def run_lenses(
+    program: Program,
+    driver: Callable[[types.Type], Callable[..., None]],
+    lenses: int,
+    pieces: int,
+    by_lens: Mapping[int, Tensor],
+    small: int,
+) -> None:
+    """Run a driver for every lens; threads share lenses, or the pieces of a single one.
+
+    Args:
+        program: of the first lens, pointed to everything that the driver needs.
+        driver: the factory of the driver of one lens.
+        lenses: L.
+        pieces: of one lens.
+        by_lens: place in the job → tensor (L, ...) whose first lens that place points to; a stride
+            of zero shares it.
+        small: fewer rays than this, of all lenses, are traced by one thread.
+    """
+    if lenses == 1:
+        program.run(driver, pieces, small)
+        return
+    pairs = [(place, t.stride(0) * t.element_size()) for place, t in by_lens.items()]
+    strides = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    job = program.job
+    job[jobs.INNER_DRIVER] = compiler.compile_driver(driver, program.real)
+    job[jobs.INNER_PIECES], job[jobs.STRIDE_PAIRS] = pieces, len(strides)
+    job[jobs.STRIDES] = strides.ctypes.data
+    program.run(lenses_driver, lenses, small, lenses)

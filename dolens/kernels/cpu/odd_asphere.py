@@ -25,6 +25,9 @@ from dolens.kernels.cpu.even_asphere import (
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
     OF_SAG,
     OF_SLOPE_X,
     OF_SLOPE_Y,
@@ -39,7 +42,6 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT
 
 # mm²: closer to the axis than its root a point counts as the vertex, as in the reference.
 VERTEX = 1e-30

@@ -5,32 +5,11 @@ from collections.abc import Callable
 
 from numba import carray, types
 
+from dolens.kernels.cpu.apertures import stopped_by_figures
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import shifted
-from dolens.kernels.cpu.figures import stopped_by_figures
-from dolens.kernels.cpu.functions import StepFunctions
+from dolens.kernels.cpu.compiler import StepFunctions, shifted
 from dolens.kernels.cpu.layout import (
     BLOCK,
-    INDEX,
-    INVERSE_INDEX,
-    OF_BEHIND,
-    OF_FRONT,
-    OF_SHIFT,
-    PATH,
-    RATIO,
-    STATE,
-    TRAVELLED,
-    UNBOUNDED,
-    VIGNETTED,
-    WORK_SIZE,
-    L,
-    M,
-    N,
-    X,
-    Y,
-    Z,
-)
-from dolens.kernels.cpu.records import (
     CENTER_X,
     CENTER_Y,
     CIRCLE,
@@ -43,16 +22,34 @@ from dolens.kernels.cpu.records import (
     HOLE,
     HOLE_X,
     HOLE_Y,
+    INDEX,
+    INVERSE_INDEX,
     LIMIT,
+    OF_BEHIND,
+    OF_FRONT,
+    OF_SHIFT,
     OUTLINE,
+    PATH,
+    RATIO,
     RECTANGLE,
     REFRACTS,
     SENSE,
     SENSE_BEHIND,
     SHIFT,
     SHORT_RECORD,
+    STATE,
     STOPPED,
     TAG,
+    TRAVELLED,
+    UNBOUNDED,
+    VIGNETTED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
 )
 from dolens.kernels.limits import GRAZING
 

@@ -9,19 +9,29 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.functions import StepFunctions
+from dolens.kernels.cpu.compiler import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    EDGE,
     ENDED,
     INDEX,
     INVERSE_INDEX,
+    LIMIT,
     OF_BEHIND,
     OF_FRONT,
     OF_SHAPE,
     OF_SHIFT,
     PATH,
     RATIO,
+    REFRACTS,
+    SENSE,
+    SENSE_BEHIND,
+    SHAPE,
+    SHIFT,
+    SHORT_RECORD,
     STATE,
+    TAG,
     TRAVELLED,
     UNBOUNDED,
     WORK_SIZE,
@@ -31,18 +41,6 @@ from dolens.kernels.cpu.layout import (
     X,
     Y,
     Z,
-)
-from dolens.kernels.cpu.records import (
-    CODE_ROW,
-    EDGE,
-    LIMIT,
-    REFRACTS,
-    SENSE,
-    SENSE_BEHIND,
-    SHAPE,
-    SHIFT,
-    SHORT_RECORD,
-    TAG,
 )
 from dolens.kernels.limits import GRAZING
 

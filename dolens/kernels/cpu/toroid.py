@@ -22,6 +22,8 @@ from dolens.kernels.cpu.even_asphere import (
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COUNT,
     FURTHER,
     MARGIN,
     OF_SAG,
@@ -36,7 +38,6 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     UNBOUNDED,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COUNT
 from dolens.kernels.limits import GRAZING, TINY
 
 # A work row of its own: x, while the section is evaluated at x = 0.

@@ -17,7 +17,12 @@ from dolens.kernels.cpu.compiler import OPTIONS, int64_at, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
     CUBIC,
+    DEGREE,
+    EXTRAS_ADDRESS,
     FURTHER,
     MARGIN,
     OF_SAG,
@@ -32,12 +37,12 @@ from dolens.kernels.cpu.layout import (
     SAG_XX,
     SAG_XY,
     SAG_YY,
+    SHAPE,
     SLOPE_X,
     SLOPE_Y,
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, DEGREE, EXTRAS_ADDRESS, SHAPE
 
 # Work rows: W, P_x and P_y; then the powers of x from the zeroth to the degree, and those of y.
 ROOT, P_X, P_Y = OWN[-4:-1]

@@ -25,6 +25,10 @@ from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.jacobi import jacobi
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    COUNT,
+    DEGREE,
+    EXTRAS_ADDRESS,
     FURTHER,
     OF_SAG,
     OF_SLOPE_X,
@@ -39,7 +43,6 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     UNBOUNDED,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COUNT, DEGREE, EXTRAS_ADDRESS
 
 CONSTANTS = 3  # normalisation radius and decentre, before the coefficients
 # Work rows: u, v and q; w^m, w^(m-1) and w^(m-2); A and B with two derivatives; the recurrence.

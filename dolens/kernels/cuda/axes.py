@@ -6,7 +6,7 @@ They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import GRAZING, divide
+from dolens.kernels.cuda.arithmetic import GRAZING, add_sum, divide
 from dolens.kernels.cuda.layout import (
     STEP_X,
     STEP_Y,
@@ -21,7 +21,6 @@ from dolens.kernels.cuda.layout import (
     TURN_ZY,
     TURN_ZZ,
 )
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

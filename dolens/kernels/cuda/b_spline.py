@@ -7,10 +7,9 @@ The record holds the knots in x, the knots in y, and the coefficients, rows alon
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide
+from dolens.kernels.cuda.arithmetic import add_sum, divide, first_of
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
-from dolens.kernels.cuda.sums import add_sum, first_of
 
 MORE_KNOTS = tl.constexpr(4)  # than coefficients
 

@@ -6,10 +6,9 @@ Here e_x = (1+k_x)·c_x² and e_y = (1+k_y)·c_y².  The record holds c_x, c_y, 
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import TINY, divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import TINY, add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -7,9 +7,8 @@ sphere, where k = 0.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import GRAZING, clamp, divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import GRAZING, add_sum, clamp, divide, safe_sqrt
 from dolens.kernels.cuda.layout import SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -6,10 +6,9 @@ The record holds c, k, a2, and the coefficients of H.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COUNT, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -10,7 +10,7 @@ the secant of the conic's normal, σ' = σ·κ/(2ab).
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.even_asphere import (
     even_asphere_hessian,
     even_asphere_sag,
@@ -19,7 +19,6 @@ from dolens.kernels.cuda.even_asphere import (
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
 from dolens.kernels.cuda.layout import COLUMNS, DEGREE, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # the normalisation radius, and then the coefficients
 STEEPEST = tl.constexpr(1e-12)  # as in the reference

@@ -7,9 +7,8 @@ Numbers: the power φ, and the reduced vergence V of the light that arrives.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import GRAZING, divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import GRAZING, add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.functions import LawFunctions
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -1,4 +1,4 @@
-"""The recurrence of Jacobi polynomials; see `dolens.optics.surfaces.jacobi`."""
+"""The recurrence of Jacobi polynomials; see `dolens.optics.surfaces.zernike`."""
 
 import triton
 import triton.language as tl

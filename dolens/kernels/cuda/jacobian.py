@@ -9,7 +9,6 @@ every kind of surface; sweeps back pass it once for each output, by those that t
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.adjoint import keep, kept
 from dolens.kernels.cuda.arithmetic import finite
 from dolens.kernels.cuda.layout import (
     AFTER,
@@ -24,15 +23,17 @@ from dolens.kernels.cuda.layout import (
     X,
     Y,
 )
-from dolens.kernels.cuda.rays import (
+from dolens.kernels.cuda.step import step
+from dolens.kernels.cuda.step_adjoint import step_adjoint
+from dolens.kernels.cuda.trace import (
     first_sense,
+    keep,
+    kept,
     load_columns,
     load_media,
     load_vectors,
     stop_unphysical,
 )
-from dolens.kernels.cuda.step import step
-from dolens.kernels.cuda.step_adjoint import step_adjoint
 
 # One compiled kernel serves bundles of any size, strides and alignment, and any variables.
 _VARYING = (

@@ -11,16 +11,13 @@ import triton
 from torch import Tensor
 
 from dolens.kernels.cuda import launching
-from dolens.kernels.cuda.adjoint import adjoint_kernel
-from dolens.kernels.cuda.codes import prepared
-from dolens.kernels.cuda.forward import forward_kernel
+from dolens.kernels.cuda.device_table import device_entries, prepared
 from dolens.kernels.cuda.jacobian import jacobian_kernel
 from dolens.kernels.cuda.launching import on, program_count, strides
 from dolens.kernels.cuda.layout import STATE
-from dolens.kernels.cuda.variable_entries import device_entries
+from dolens.kernels.cuda.trace import adjoint_kernel, forward_kernel
 from dolens.kernels.least_squares_sums import least_squares_sums
-from dolens.kernels.table import SurfaceTable
-from dolens.kernels.variable_map import VariableMap
+from dolens.kernels.table import SurfaceTable, VariableMap
 
 RayTensors = tuple[Tensor, Tensor, Tensor | None]
 # Numbers of a Jacobian, or of groups, that are held at a time while normal equations are added up.
@@ -145,7 +142,7 @@ def ray_jacobians(
     Args:
         table: as in `trace`.
         variables: P of them, of E entries, the same for all lenses.
-        outputs: K names of `dolens.kernels.variable_map.OUTPUT_ROWS`.
+        outputs: K names of `dolens.kernels.table.OUTPUT_ROWS`.
         rays: as in `trace`.
         weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
         index_derivatives: (L, entries, wavelengths), float64, for `variables.indices`.

@@ -6,7 +6,7 @@ The record holds the even asphere's numbers, then a1 and the coefficients of H.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide
+from dolens.kernels.cuda.arithmetic import add_sum, divide
 from dolens.kernels.cuda.even_asphere import (
     even_asphere_hessian,
     even_asphere_sag,
@@ -14,7 +14,6 @@ from dolens.kernels.cuda.even_asphere import (
 )
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 # mm²: closer to the axis than its root a point counts as the vertex, as in the reference.
 VERTEX = tl.constexpr(1e-30)

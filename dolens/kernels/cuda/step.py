@@ -1,16 +1,37 @@
-"""A step carries a block of rays through a surface, to other axes, or to the sensor."""
+"""A step carries a block of rays through a surface, to other axes, or to the sensor.
+
+Newton's iteration finds the intercept on a surface that is given by its sag.
+
+A surface's gradient g = ∇F at a point, F's second derivatives, and cotangents of its numbers.
+
+F = z - sag, or a conic's implicit form; the unit normal is g/|g|.
+
+"""
 
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import clamp, distance_to_plane, refract
+from dolens.kernels.cuda.arithmetic import (
+    add_sum,
+    away_from_zero,
+    clamp,
+    distance_to_plane,
+    divide,
+    refract,
+    safe_sqrt,
+)
 from dolens.kernels.cuda.axes import change_axes, lens_axes
-from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
-from dolens.kernels.cuda.explicit import explicit_intersect
-from dolens.kernels.cuda.figures import clear_of_figures
-from dolens.kernels.cuda.functions import CODE, LAW_CODE, LAW_FORWARD
-from dolens.kernels.cuda.gradient import surface_gradient
+from dolens.kernels.cuda.conic import (
+    conic_curvature_cotangent,
+    conic_distance,
+    conic_gradient,
+    conic_intersect,
+    conic_sums,
+    sphere_intersect,
+)
+from dolens.kernels.cuda.functions import CODE, HESSIAN, LAW_CODE, LAW_FORWARD, ON_CONIC, SAG, SUMS
 from dolens.kernels.cuda.layout import (
+    ARM,
     BASE,
     CENTER_X,
     CENTER_Y,
@@ -20,6 +41,7 @@ from dolens.kernels.cuda.layout import (
     DEFLECT,
     EDGE,
     ELLIPSE,
+    ELLIPTIC,
     FIGURES,
     HALF_X,
     HALF_Y,
@@ -37,7 +59,9 @@ from dolens.kernels.cuda.layout import (
     LAW,
     LENS_AXES,
     LIMIT,
+    MAX_STEPS,
     MISSED,
+    MORE_STEPS,
     NUMBERS,
     OUTLINE,
     PLANE,
@@ -47,6 +71,7 @@ from dolens.kernels.cuda.layout import (
     SENSE,
     SENSE_BEHIND,
     SENSOR,
+    SHAPE,
     SHIFT,
     SPHERE,
     TAG,
@@ -184,3 +209,166 @@ def step(
             x, y, z = x + travelled * l, y + travelled * m, tl.zeros_like(x)
             ended = tl.where((ended > 0) | towards, ended, tag + MISSED)
     return x, y, z, l, m, n, path + index * travelled, ended, vignetted, travelled
+
+
+@triton.jit
+def explicit_intersect(
+    record, codes, extras, x, y, l, m, n, sense, limit, scale, FORM: tl.constexpr
+):
+    """Return the distance from the vertex plane, the unit normal there, and whether it is met.
+
+    As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after
+    `MAX_STEPS`; whether a ray has converged is read off its residual at the end.
+    """
+    # √ε, its power 7/8, and 64 ε.
+    close = 2.0**-26 if x.dtype == tl.float64 else 2.0**-11.5
+    closest = 2.0**-45.5 if x.dtype == tl.float64 else 2.0**-20.125
+    rounding = 2.0**-46 if x.dtype == tl.float64 else 2.0**-17
+    t = tl.zeros_like(x)
+    if FORM[ON_CONIC]:
+        c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
+        start, squared = conic_distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
+        t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
+    moving = tl.full((), 1, tl.int32)
+    steps = tl.full((), 0, tl.int32)
+    most = tl.full((), MAX_STEPS, tl.int32)
+    while (moving > 0) & (steps < most):
+        sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+        change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
+        change = clamp(change, scale)
+        t = t - change
+        moves = tl.abs(change) > close * (tl.abs(t) + scale)
+        moving = tl.max(moves.to(tl.int32), 0)
+        steps += 1
+        if FORM[ON_CONIC]:
+            if ((moving == 0) | (steps == most)) & (most == MAX_STEPS):
+                # Rays that end at no root that counts begin once more, on the vertex plane.
+                sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+                slope = l * sx + m * sy - n
+                reach = tl.abs(slope) * (tl.abs(t) + scale)
+                counts = (sense * slope < 0.0) & (tl.abs(sag - n * t) <= close * reach)
+                again = (t != 0.0) & ~counts
+                t = tl.where(again, 0.0, t)
+                moving = tl.max(again.to(tl.int32), 0)
+                most = steps + MAX_STEPS
+    # Rays along a tangent are not there yet: they take some steps more.  Where the loop went on to
+    # its end, those that converge have done so long before.
+    sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+    moving, steps = 1 - moving, tl.full((), 0, tl.int32)
+    while (moving > 0) & (steps < MORE_STEPS):
+        residual, slope = sag - n * t, l * sx + m * sy - n
+        reach = tl.abs(slope) * (tl.abs(t) + scale)
+        again = (tl.abs(residual) > closest * reach) & (tl.abs(residual) <= close * reach)
+        t = tl.where(again, t - divide(residual, away_from_zero(slope)), t)
+        moving = tl.max(again.to(tl.int32), 0)
+        if moving > 0:
+            sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+        steps += 1
+    residual = sag - n * t
+    slope = l * sx + m * sy - n
+    steep = tl.where(tl.abs(slope) > 1.0, tl.abs(slope), 1.0)
+    allowed = rounding * (tl.abs(sag) + (tl.abs(t) + scale) * steep)
+    met = (sense * slope < 0.0) & (margin > 0.0) & (tl.abs(residual) < allowed)
+    # One step more, too short to matter for the slopes.
+    change = clamp(divide(residual, away_from_zero(slope)), scale)
+    met &= (tl.abs(change) <= 1e-2 * (tl.abs(t) + scale)) & (tl.abs(residual) <= limit)
+    t = clamp(t - change, limit)
+    nz = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
+    return t, -sx * nz, -sy * nz, nz, met
+
+
+@triton.jit
+def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
+    """Return g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
+    sx, sy, sxx, sxy, syy = FORM[HESSIAN](record, codes, extras, x, y)
+    gz = 1.0 + tl.zeros_like(x)
+    inverse = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
+    return -sx, -sy, gz, inverse, -sxx, -sxy, -syy, tl.zeros_like(x)
+
+
+@triton.jit
+def surface_gradient(
+    record, codes, extras, kind, x, y, z, KINDS: tl.constexpr, FORMS: tl.constexpr
+):
+    """Return g, 1/|g|, and F's second derivatives xx, xy, yy and zz, at a point of any surface."""
+    gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), 1.0 + tl.zeros_like(x)
+    inverse = 1.0 + tl.zeros_like(x)
+    xx, xy, yy, zz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+    if HAS_SPHERE & KINDS:
+        if kind == SPHERE:
+            gx, gy, gz, _, xx, zz = conic_gradient(tl.load(record + SHAPE), 0.0, x, y, z)
+            yy = xx
+    if HAS_CONIC & KINDS:
+        if kind == CONIC:
+            c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
+            gx, gy, gz, inverse, xx, zz = conic_gradient(c, k, x, y, z)
+            yy = xx
+    for k in tl.static_range(len(FORMS)):
+        if kind == FORMS[k][CODE]:
+            gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
+                record, codes, extras, x, y, FORMS[k]
+            )
+    return gx, gy, gz, inverse, xx, xy, yy, zz
+
+
+@triton.jit
+def shape_sums(
+    record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive,
+    KINDS: tl.constexpr, FORMS: tl.constexpr,
+):  # fmt: skip
+    """Add the cotangents of a shape's numbers, from τ and (ux, uy, uz), the cotangent of g."""
+    if HAS_SPHERE & KINDS:
+        if kind == SPHERE:
+            of_c = conic_curvature_cotangent(0.0, x, y, z, along, ux, uy, uz)
+            add_sum(sums + SHAPE, of_c, alive)
+    if HAS_CONIC & KINDS:
+        if kind == CONIC:
+            conic_sums(record, sums, x, y, z, along, ux, uy, uz, alive)
+    for k in tl.static_range(len(FORMS)):
+        if kind == FORMS[k][CODE]:
+            FORMS[k][SUMS](record, codes, extras, sums, x, y, along, -ux, -uy, alive)
+
+
+@triton.jit
+def in_polygon(sides, count, x, y, on_it):
+    """Return whether points are inside a polygon; on a side the answer is `on_it`."""
+    odd = tl.full(x.shape, 0, tl.int32)
+    on = tl.full(x.shape, 0, tl.int32)
+    for k in range(count // 4):
+        ax, ay = tl.load(sides + 4 * k), tl.load(sides + 4 * k + 1)
+        bx, by = tl.load(sides + 4 * k + 2), tl.load(sides + 4 * k + 3)
+        u, v = x - ax, y - ay
+        cross = (bx - ax) * v - (by - ay) * u
+        here = (cross == 0.0) & (u * (x - bx) <= 0.0) & (v * (y - by) <= 0.0)
+        on = on | here.to(tl.int32)
+        # The lower end of a side counts and the upper one does not.
+        upwards = (y >= ay) & (y < by) & (cross > 0.0)
+        downwards = (y >= by) & (y < ay) & (cross < 0.0)
+        odd = odd ^ (upwards | downwards).to(tl.int32)
+    return tl.where(on > 0, on_it, odd > 0)
+
+
+@triton.jit
+def clear_of_figures(figures, x, y):
+    """Return whether no figure stops the rays at x, y; `figures` points to their numbers."""
+    clear = tl.full(x.shape, 1, tl.int32)
+    at = figures + 1
+    for _ in range(tl.load(figures).to(tl.int32)):
+        kind, count = tl.load(at).to(tl.int32), tl.load(at + 4).to(tl.int32)
+        blocks = tl.load(at + 1) > 0.5
+        u, v = x - tl.load(at + 2), y - tl.load(at + 3)
+        own = at + 5
+        inside = tl.full(x.shape, 0, tl.int32)
+        if kind == ELLIPTIC:
+            square = tl.load(own) * u * u + tl.load(own + 1) * v * v
+            within = (square >= tl.load(own + 2)) & (square <= tl.load(own + 3))
+            inside = within.to(tl.int32)
+        elif kind == ARM:
+            c, s = tl.load(own), tl.load(own + 1)
+            within = (c * u + s * v >= 0.0) & (tl.abs(c * v - s * u) <= tl.load(own + 2))
+            inside = within.to(tl.int32)
+        else:
+            inside = in_polygon(own, count, u, v, blocks).to(tl.int32)
+        clear = clear & (inside != blocks.to(tl.int32)).to(tl.int32)
+        at = at + 5 + count
+    return clear > 0

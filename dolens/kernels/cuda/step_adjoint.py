@@ -9,10 +9,9 @@ N = g/|g| passes its cotangent on to g, and g to P by F's second derivatives and
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, refract_adjoint
+from dolens.kernels.cuda.arithmetic import add_sum, divide, refract_adjoint
 from dolens.kernels.cuda.axes import change_axes_adjoint, lens_axes_adjoint
 from dolens.kernels.cuda.functions import LAW_ADJOINT, LAW_CODE
-from dolens.kernels.cuda.gradient import shape_sums, surface_gradient
 from dolens.kernels.cuda.layout import (
     BASE,
     CHANGE_AXES,
@@ -30,7 +29,7 @@ from dolens.kernels.cuda.layout import (
     SENSOR,
     SHIFT,
 )
-from dolens.kernels.cuda.sums import add_sum
+from dolens.kernels.cuda.step import shape_sums, surface_gradient
 
 
 @triton.jit

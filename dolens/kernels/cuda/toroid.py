@@ -7,7 +7,7 @@ c, the curvature along x.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import GRAZING, TINY, divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import GRAZING, TINY, add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.even_asphere import (
     even_asphere_hessian,
     even_asphere_sag,
@@ -15,7 +15,6 @@ from dolens.kernels.cuda.even_asphere import (
 )
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COUNT, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 C_X = tl.constexpr(int(SHAPE) + 3)  # its place where there are no even coefficients but a2
 

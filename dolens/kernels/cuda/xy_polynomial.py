@@ -11,10 +11,9 @@ from collections.abc import Sequence
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, DEGREE, EXTRAS, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 from dolens.kernels.table import Code, Slot
 
 

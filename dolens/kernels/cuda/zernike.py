@@ -8,7 +8,7 @@ azimuthal order m add up to Re(w^m)·A(q) + Im(w^m)·B(q), q = u² + v².
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.even_asphere import (
     even_asphere_hessian,
     even_asphere_sag,
@@ -17,7 +17,6 @@ from dolens.kernels.cuda.even_asphere import (
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
 from dolens.kernels.cuda.layout import COUNT, DEGREE, EXTRAS, SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # where there are no even coefficients but a2
 CONSTANTS = tl.constexpr(3)  # normalisation radius and decentre, before the coefficients

@@ -19,8 +19,7 @@ from dolens.lens_search.glass.dispersion_coordinates import (
     nd_vd_deviation,
 )
 from dolens.optics.agf import RESISTANCES, STATUSES
-from dolens.optics.glass_catalog import suggestion
-from dolens.optics.glass_folders import VARIABLE
+from dolens.optics.glass_catalog import VARIABLE, suggestion
 from dolens.optics.glass_properties import CatalogueGlass, catalogue_glasses
 from dolens.optics.materials import INDEX_MODELS, parse_material
 

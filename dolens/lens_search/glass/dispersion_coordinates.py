@@ -3,7 +3,7 @@
 The coordinates are nd, the principal dispersion nF - nC, and (nF - nC) ΔPgF, the distance of
 ng - nF from Schott's normal line; each is measured from a common centre in a unit that is about
 the spread of the makers' glasses.  Conrady's formula through nd, nF - nC and ng - nF (see
-`dolens.optics.model_glass`) is linear in those three, since the normal line makes
+`dolens.optics.dispersion`) is linear in those three, since the normal line makes
 
     ng - nF = 0.6438 (nF - nC) - 0.001682 (nd - 1) + (nF - nC) ΔPgF.
 
@@ -43,8 +43,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import LINE_G, model_glass
 from dolens.optics.materials import INDEX_MODELS, LINE_C, LINE_D, LINE_F, Medium
-from dolens.optics.model_glass import LINE_G, model_glass
 
 # nd, nF - nC and (nF - nC) ΔPgF at the coordinates (0, 0, 0), and of a step of 1.
 CENTRE = (1.6, 0.012, 0.0)

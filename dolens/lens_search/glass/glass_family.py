@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dolens.kernels.variable_map import VariableMap
+from dolens.kernels.table import VariableMap
 from dolens.lens_search.arrangement import AIR, Arrangement
 from dolens.lens_search.glass.choice import GlassSet
 from dolens.optics.lens_family import FamilyJacobian, FamilyRays, FamilySums, LensFamily

@@ -9,8 +9,7 @@ belongs to nobody else: pyplot does not know it.
 The numbers behind each figure come from the functions that the methods call.
 """
 
-from dolens.optics.lens_views.image_points import ImagePointViews
-from dolens.optics.lens_views.over_field import OverFieldViews
+from dolens.optics.lens_views.image_quality import ImagePointViews, OverFieldViews
 from dolens.optics.lens_views.overview import OverviewViews
 from dolens.optics.lens_views.wavefronts import WavefrontViews
 

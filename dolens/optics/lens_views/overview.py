@@ -1,18 +1,21 @@
-"""What a lens is: its prescription, its numbers and its section."""
+"""A lens shows its prescription, numbers and section, at conditions that all views share."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from inspect import signature
+from typing import TYPE_CHECKING, Any
 
-from dolens.optics.lens_views.conditions import looked_at, shown
+from torch import Tensor
+
 from dolens.optics.prescription_table import PrescriptionTable, prescription_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from dolens.analysis.conditions import FieldPoints
+    from dolens.analysis.conditions import Conditions, FieldPoints
     from dolens.analysis.summary import LensSummary
-    from dolens.optics.lens_views.conditions import Wavelengths
+    from dolens.optics.lens import Lens
 
 
 class OverviewViews:
@@ -74,3 +77,55 @@ class OverviewViews:
                 rays,
             )
         )
+
+
+Wavelengths = float | Sequence[float] | Tensor | None
+
+
+def as_lens(views: Any) -> Lens:
+    """Return the lens whose methods these views are."""
+    return views
+
+
+def looked_at(
+    view: Any,
+    fields: FieldPoints | None,
+    wavelengths: Wavelengths,
+    object_distance: float | None,
+    aperture: dict[str, float],
+) -> tuple[Lens, Conditions]:
+    """Return the lens of a view at an aperture, and the conditions that it is looked at.
+
+    Args:
+        view: the method of the lens that was called.
+        fields: see `LensViews`, as the next two.
+        wavelengths: nm.
+        object_distance: mm.
+        aperture: the other keyword arguments of the call.
+
+    Raises:
+        InputError: the method has no such argument.
+    """
+    from dolens.analysis.conditions import conditions
+    from dolens.errors import check_keys
+    from dolens.optics.field_and_aperture import with_aperture
+
+    settings = ("f_number", "entrance_pupil_diameter")
+    named = [name for name in signature(view).parameters if name != "aperture"]
+    check_keys(aperture, (*named, *settings), f"{view.__name__}()")
+    lens = with_aperture(view.__self__, **aperture)
+    return lens, conditions(lens, fields, wavelengths, object_distance)
+
+
+def title_of(what: str, lens: Lens, given: Conditions) -> str:
+    """Return the title of a figure: what it shows, of which lens, and at which conditions."""
+    from dolens.plotting.captions import caption
+
+    return caption(what, lens, given.wavelengths, given.object_distance)
+
+
+def shown(figure: Figure) -> Figure:
+    """Return a figure that a notebook shows, once, whether pyplot was imported or not."""
+    from dolens.plotting.export import showing
+
+    return showing(figure)

@@ -10,8 +10,8 @@ from dolens.optics.surfaces.coordinate_break import BREAKS, CoordinateBreak, Til
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.forbes import QBfs, QCon
 from dolens.optics.surfaces.grid_sag import GridSag
+from dolens.optics.surfaces.ideal_lens import ParaxialLens
 from dolens.optics.surfaces.odd_asphere import OddAsphere
-from dolens.optics.surfaces.paraxial_lens import ParaxialLens
 from dolens.optics.surfaces.phase import PHASES, Grating, Phase, RadialPhase, XYPhase
 from dolens.optics.surfaces.plane import Aperture, Plane
 from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface

@@ -4,11 +4,12 @@ Whether a ray is valid is carried as margins: numbers that are positive where a 
 The minimum of all margins decides at the end.  Comparing and selecting by masks costs five times
 the arithmetic, so invalid rays are kept finite by clamps instead, at limits that no valid ray
 reaches; their gradient is cut off where the trace ends.
+
 """
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +18,6 @@ from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.rays import Components
-from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
@@ -25,6 +25,24 @@ from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
 if TYPE_CHECKING:
     from dolens.optics.surfaces.deflection import Law
     from dolens.optics.surfaces.phase import Phase
+
+_Packed = TypeVar("_Packed", bound=Callable[..., Any])
+
+
+def by_names(packed: _Packed) -> _Packed:
+    """Mark a `packed` that returns stored parameters, chosen by their names and shapes alone.
+
+    What such a method returned holds for any values of the same parameters, so that a lens whose
+    shapes have no other need not be asked at every trace.  Overriding a method takes its mark away.
+    """
+    packed.by_names = True  # type: ignore[attr-defined]
+    return packed
+
+
+def is_by_names(packed: Callable[..., Any]) -> bool:
+    """Return whether a `packed` has the mark."""
+    return getattr(packed, "by_names", False)
+
 
 Parameters = Mapping[str, Tensor]
 

@@ -11,8 +11,7 @@ from dolens.kernels.limits import GRAZING, TINY
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.rays import Components
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
-from dolens.optics.surfaces.by_names import by_names
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.refraction import PlaneRay, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 

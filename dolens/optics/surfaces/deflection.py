@@ -11,9 +11,8 @@ from typing import ClassVar, NamedTuple
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.kernels.law_kernel import LawKernel
-from dolens.optics.surfaces.base import Parameters
-from dolens.optics.surfaces.by_names import by_names
+from dolens.kernels.surface_kernel import LawKernel
+from dolens.optics.surfaces.base import Parameters, by_names
 
 Number = float | Tensor
 Vector = tuple[Tensor, Tensor, Tensor]

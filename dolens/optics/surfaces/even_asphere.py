@@ -1,4 +1,4 @@
-"""An even asphere is a conic plus powers of r² (S1, S2)."""
+"""An even asphere is a conic plus powers of r² (S1, S2); other shapes add further terms to it."""
 
 from collections.abc import Mapping
 
@@ -7,12 +7,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters
-from dolens.optics.surfaces.by_names import by_names
-from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
-from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
+from dolens.optics.surfaces.conic import Conic, check_reach, conic_distance, conic_sag
 from dolens.optics.surfaces.refraction import PlaneRay
-from dolens.optics.surfaces.registry import register_surface
+from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
 
 _POWER = order_pattern("a")
 
@@ -114,3 +112,65 @@ class EvenAsphere(Conic):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the unit normal from the slopes."""
         return super(Conic, cls).normal(p, x, y, z)
+
+
+class AsphereWithTerms(Surface):
+    """The sag is that of an even asphere plus `added_terms`.
+
+    A subclass offers `added_terms`, `added_names` and `added_numbers`.  Its kernels call those of
+    the even asphere, and take the further numbers behind c, k, a2, a4, ....
+    """
+
+    @classmethod
+    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what is added to the sag (mm) and to its slopes along x and y at points (mm)."""
+        raise NotImplementedError
+
+    @classmethod
+    def added_names(cls, keys: Mapping[str, object]) -> list[str]:
+        """Return the parameters of the added terms, of a surface with these keys."""
+        raise NotImplementedError
+
+    @classmethod
+    def added_numbers(cls, p: Parameters) -> PackedShape:
+        """Return the numbers of the added terms; `count` is the even asphere's and not used."""
+        raise NotImplementedError
+
+    def check_aperture(self) -> None:
+        """Check that the clear aperture ends where the conic does: (1+k)·c²·r² ≤ 1."""
+        check_reach(self)
+
+    @classmethod
+    def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
+        """Return curvature, conic constant, even powers, and the added terms."""
+        even = {key: value for key, value in keys.items() if even_power(str(key)) is not None}
+        return [*EvenAsphere.parameter_names(even), *cls.added_names(keys)]
+
+    @classmethod
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Return sag and slopes, and the margin of the conic's branch."""
+        sag, sx, sy, exists = EvenAsphere.sag_and_gradient(even_asphere(p), x, y)
+        added, ax, ay = cls.added_terms(p, x, y)
+        return sag + added, sx + ax, sy + ay, exists
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape:
+        """Return the even asphere's numbers, and then those of the added terms."""
+        even, added = EvenAsphere.packed(even_asphere(p)), cls.added_numbers(p)
+        return added._replace(numbers=(*even.numbers, *added.numbers), count=even.count)
+
+    @classmethod
+    def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
+        """Return the conic's own intersection, or the vertex plane where that is out of reach."""
+        return EvenAsphere.start(p, ray, sense)
+
+
+def even_asphere(p: Parameters) -> dict[str, Tensor]:
+    """Return the parameters of the even asphere among those of a surface."""
+    return {
+        name: value
+        for name, value in p.items()
+        if name in ("curvature", "conic") or even_power(name) is not None
+    }

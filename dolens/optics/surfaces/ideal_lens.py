@@ -16,11 +16,14 @@ These are Zemax's PARAXIAL with its OPD mode 0 (conjugates from the paraxial axi
 length is meant in air: the power φ is 1/f in any media, as in Zemax.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
-from dolens.kernels.law_kernel import LawKernel
+from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
+from dolens.kernels.surface_kernel import LawKernel
 from dolens.optics.surfaces.base import Parameters
 from dolens.optics.surfaces.deflection import (
     Deflected,
@@ -31,6 +34,8 @@ from dolens.optics.surfaces.deflection import (
     Travel,
     Vector,
 )
+from dolens.optics.surfaces.plane import Plane
+from dolens.optics.surfaces.registry import register_surface
 
 
 class IdealLens(Law):
@@ -99,3 +104,23 @@ class IdealLens(Law):
     def fourth_order_path(cls, p: Parameters) -> Number:
         """Return zero: the lens has no aberrations, and `seidel` passes it over."""
         return 0.0
+
+
+@register_surface
+class ParaxialLens(Plane):
+    """The surface is a plane that deflects as an ideal lens of power φ (1/mm) in air; see
+    `IdealLens`.
+    """
+
+    kind = "paraxial_lens"
+    kernel = Plane.kernel
+    law = IdealLens
+    rotational = True
+    closed_form = True
+
+    @classmethod
+    def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
+        """Return the power."""
+        if "power" not in keys:
+            raise InputError("a paraxial lens needs 'power' (1/mm) or 'focal_length' (mm)")
+        return ["power"]

@@ -7,9 +7,13 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.asphere_with_terms import AsphereWithTerms, even_asphere
 from dolens.optics.surfaces.base import PackedShape, Parameters
-from dolens.optics.surfaces.even_asphere import EvenAsphere, power_of
+from dolens.optics.surfaces.even_asphere import (
+    AsphereWithTerms,
+    EvenAsphere,
+    even_asphere,
+    power_of,
+)
 from dolens.optics.surfaces.registry import register_surface
 
 # mm²: closer to the axis than its root a point counts as the vertex.

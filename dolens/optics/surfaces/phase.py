@@ -24,11 +24,9 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.kernels.law_kernel import LawKernel
 from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
-from dolens.optics.surfaces.base import Parameters, tensor_of
-from dolens.optics.surfaces.by_names import by_names
-from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
+from dolens.kernels.surface_kernel import LawKernel
+from dolens.optics.surfaces.base import Parameters, by_names, tensor_of
 from dolens.optics.surfaces.deflection import (
     Deflected,
     Law,
@@ -39,6 +37,7 @@ from dolens.optics.surfaces.deflection import (
     Vector,
 )
 from dolens.optics.surfaces.refraction import safe_sqrt
+from dolens.optics.surfaces.registry import order_of, order_pattern
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 
 # Path in mm for a radian of phase, over the wavelength in nm.

@@ -8,8 +8,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
-from dolens.optics.surfaces.by_names import by_names
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.even_asphere import EvenAsphere, even_power
 from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface

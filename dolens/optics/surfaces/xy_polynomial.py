@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
-from dolens.optics.surfaces.by_names import by_names
-from dolens.optics.surfaces.coefficient_names import checked_order
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.refraction import safe_sqrt
-from dolens.optics.surfaces.registry import register_surface
+from dolens.optics.surfaces.registry import checked_order, register_surface
 
 _MONOMIAL = re.compile(r"(?:(x)([2-9]|[1-9][0-9]+)?)?(?:(y)([2-9]|[1-9][0-9]+)?)?")
 

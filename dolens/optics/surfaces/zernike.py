@@ -1,20 +1,77 @@
-"""Surfaces add Zernike polynomials to a conic and even powers of r."""
+"""Zernike polynomials, by Noll's and by fringe numbers, and surfaces that add them to a conic.
 
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+Jacobi polynomials P_k^(0, m)(2q - 1) on 0 ≤ q ≤ 1, by their three-term recurrence.
+
+They are the radial part of Zernike's polynomials, R_n^m(ρ) = ρ^m·P_k^(0, m)(2ρ² - 1) with
+k = (n - m)/2, and with m = 4 Forbes's Q_con.  Recurrence keeps them accurate to any order, where
+powers of q with their alternating coefficients would lose all digits.
+
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.asphere_with_terms import AsphereWithTerms
 from dolens.optics.surfaces.base import PackedShape, Parameters
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
-from dolens.optics.surfaces.jacobi import jacobi
-from dolens.optics.surfaces.registry import register_surface
-from dolens.optics.surfaces.zernike_terms import FRINGE_TERMS, ZernikeTerm, fringe, noll
+from dolens.optics.surfaces.even_asphere import AsphereWithTerms
+from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
+
+FRINGE_TERMS = 37
+
+
+class ZernikeTerm(NamedTuple):
+    """The term is norm · R_n^m(ρ) · cos(mφ), or sin(mφ).
+
+    Attributes:
+        n: radial order.
+        m: azimuthal order, not negative.
+        sine: sin(mφ) instead of cos(mφ).
+        norm: factor of the polynomial.
+    """
+
+    n: int
+    m: int
+    sine: bool
+    norm: float
+
+
+@cache
+def noll(number: int) -> ZernikeTerm:
+    """Return a term in Noll's order, of unit variance over the unit disc.
+
+    Even numbers are cosines, odd ones sines; the norm is √(n+1), times √2 for m > 0.
+    Source: Noll, Zernike polynomials and atmospheric turbulence, J. Opt. Soc. Am. 66, 207 (1976).
+    Zemax calls this order and norm "Zernike Standard".
+    """
+    n = 0
+    while (n + 1) * (n + 2) // 2 < number:
+        n += 1
+    place = number - n * (n + 1) // 2  # from 1 within this radial order
+    m = 2 * (place // 2) if n % 2 == 0 else 2 * ((place - 1) // 2) + 1
+    return ZernikeTerm(n, m, m > 0 and number % 2 == 1, math.sqrt((n + 1) * (2 if m else 1)))
+
+
+@cache
+def fringe(number: int) -> ZernikeTerm:
+    """Return a term in the University of Arizona's order, of value 1 at the edge on its axis.
+
+    Groups have equal n + m; within one m falls from n to 0, the cosine before the sine.  The last
+    of the 37 terms is that of ρ¹² alone, out of this order.
+    """
+    if number == FRINGE_TERMS:
+        return ZernikeTerm(12, 0, False, 1.0)
+    group = math.isqrt(number - 1)  # (n + m)/2
+    place = number - group * group - 1  # from 0 within the group
+    m = group - place // 2
+    return ZernikeTerm(2 * group - m, m, m > 0 and place % 2 == 1, 1.0)
+
 
 _TERM = order_pattern("z")
 _KERNELS = ("dolens.kernels.cpu.zernike", "dolens.kernels.cuda.zernike")
@@ -147,3 +204,34 @@ class ZernikeFringe(ZernikeSag):
     kernel = SurfaceKernel(*_KERNELS)
     terms = FRINGE_TERMS
     term = staticmethod(fringe)
+
+
+@cache
+def recurrence(k: int, m: int) -> tuple[float, float, float]:
+    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), for k ≥ 1.
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 22.7.1, at x = 2q - 1.
+    """
+    if k == 1:
+        return m + 2.0, -(m + 1.0), 0.0
+    lower, here, both = 2 * k + m - 2, 2 * k + m - 1, 2 * k + m
+    scale = 2 * k * (k + m) * lower
+    slope = here * both * lower / scale
+    return 2.0 * slope, -here * m * m / scale - slope, 2 * (k - 1) * (k + m - 1) * both / scale
+
+
+def jacobi(q: Tensor, m: int, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield P_k^(0, m)(2q - 1) and its derivative in q, for k = 0, 1, ..., count - 1."""
+    value, slope = torch.ones_like(q), torch.zeros_like(q)
+    lower, lower_slope = torch.zeros_like(q), torch.zeros_like(q)
+    for k in range(count):
+        if k > 0:
+            a, b, c = recurrence(k, m)
+            factor = a * q + b
+            value, lower, slope, lower_slope = (
+                factor * value - c * lower,
+                value,
+                factor * slope + a * value - c * lower_slope,
+                slope,
+            )
+        yield value, slope

@@ -14,11 +14,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.surfaces.base import Parameters
-from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import Number, ParaxialPower
-from dolens.optics.surfaces.jacobi import jacobi
 from dolens.optics.surfaces.phase import Phase, XYPhase, register_phase
-from dolens.optics.surfaces.zernike_terms import FRINGE_TERMS, ZernikeTerm, fringe, noll
+from dolens.optics.surfaces.registry import order_of, order_pattern
+from dolens.optics.surfaces.zernike import FRINGE_TERMS, ZernikeTerm, fringe, jacobi, noll
 
 _TERM = order_pattern("z")
 _RADIANS = 2.0 * math.pi

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
-from dolens.optics.backend import cpu_kernels_serve
+from dolens.optics.ray_tracing import cpu_kernels_serve
 from dolens.rendering.auto.probes import MEAN, grey_levels
 from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from dolens.experiments.camera.views.centroids import centroid_moves
 from dolens.experiments.camera.views.truth import CENTROIDS, light_imaging, reference_imaging
-from dolens.optics.backend import say_once, with_chosen_backend
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import say_once, with_chosen_backend
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_grid import (
     IdealPlaces,

@@ -2,7 +2,7 @@
 
 from numba import njit
 
-from dolens.kernels.cpu.scalars import OPTIONS, given_by_scalars
+from dolens.kernels.cpu.explicit import OPTIONS, given_by_scalars
 
 
 def paraboloid(real):

@@ -3,9 +3,9 @@
 import triton
 import triton.language as tl
 
+from dolens.kernels.cuda.arithmetic import add_sum
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import SHAPE
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -13,8 +13,7 @@ from dolens.lens_search.glass.dispersion_coordinates import (
     medium_indices,
     nd_vd_deviation,
 )
-from dolens.optics.glass_catalog import find_glass
-from dolens.optics.glass_tables import MAKERS, table, table_glass
+from dolens.optics.glass_catalog import MAKERS, find_glass, table, table_glass
 from dolens.optics.materials import index_model, parse_material
 
 VISIBLE = (435.8343, 460.0, 486.1327, 520.0, 546.074, 587.5618, 620.0, 656.2725)

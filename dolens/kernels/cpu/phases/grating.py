@@ -5,10 +5,12 @@ from collections.abc import Callable
 
 from numba import carray, types
 
+from dolens.kernels.cpu.arithmetic import given_by_phase
 from dolens.kernels.cpu.compiler import shifted
-from dolens.kernels.cpu.deflection import given_by_phase
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    NUMBERS,
     OF_PHASE,
     OF_PHASE_Y,
     OF_RECORD,
@@ -21,7 +23,6 @@ from dolens.kernels.cpu.layout import (
     POINT_Y,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, NUMBERS
 
 
 def grating_phase(real: types.Type) -> Callable[..., None]:

@@ -4,10 +4,13 @@ from collections.abc import Callable
 
 from numba import carray, types
 
+from dolens.kernels.cpu.arithmetic import given_by_phase
 from dolens.kernels.cpu.compiler import shifted
-from dolens.kernels.cpu.deflection import given_by_phase
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    LENGTH,
+    NUMBERS,
     OF_PHASE,
     OF_PHASE_X,
     OF_PHASE_Y,
@@ -24,7 +27,6 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, LENGTH, NUMBERS
 
 # Rows of q, h, h' and h''/2; of the cotangents: powers of q, and the weight of the slope.
 Q, H, SLOPE, SECOND, *_ = OWN_OF_PHASE

@@ -10,10 +10,13 @@ from typing import Any
 
 from numba import carray, njit, types
 
+from dolens.kernels.cpu.arithmetic import given_by_phase
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
-from dolens.kernels.cpu.deflection import given_by_phase
 from dolens.kernels.cpu.layout import (
     BLOCK,
+    CODE_ROW,
+    LENGTH,
+    NUMBERS,
     OF_PHASE,
     OF_PHASE_X,
     OF_PHASE_Y,
@@ -30,7 +33,6 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, LENGTH, NUMBERS
 
 # Rows of u and v; of a row of the polynomial and its derivatives; of the cotangents: powers.
 U, V, ROW, ROW_U, ROW_UU, _ = OWN_OF_PHASE

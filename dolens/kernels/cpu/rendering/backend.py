@@ -11,10 +11,9 @@ from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.layout import BLOCK
 from dolens.kernels.cpu.program import Program
 from dolens.kernels.cpu.rendering import layout
-from dolens.kernels.cpu.rendering.render import render_driver
-from dolens.kernels.cpu.rendering.render_adjoint import render_adjoint_driver
+from dolens.kernels.cpu.rendering.render import render_adjoint_driver, render_driver
+from dolens.kernels.rendering import View
 from dolens.kernels.table import SurfaceTable
-from dolens.kernels.view import View
 
 # Groups of blocks that sums are kept for: enough for any processor's threads, but fewer where each
 # needs a texture's memory.

@@ -5,9 +5,8 @@ import math
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.deflection import deflect, deflect_adjoint
+from dolens.kernels.cuda.arithmetic import add_sum, deflect, deflect_adjoint
 from dolens.kernels.cuda.functions import LawFunctions
-from dolens.kernels.cuda.sums import add_sum
 
 _TURN = tl.constexpr(2.0 * math.pi)
 

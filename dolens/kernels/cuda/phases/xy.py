@@ -3,11 +3,9 @@
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide
-from dolens.kernels.cuda.deflection import deflect, deflect_adjoint
+from dolens.kernels.cuda.arithmetic import add_sum, deflect, deflect_adjoint, divide
 from dolens.kernels.cuda.functions import LawFunctions
 from dolens.kernels.cuda.layout import LENGTH, NUMBERS
-from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit

@@ -1,4 +1,4 @@
-"""A lens that is made departs from its drawing also by numbers that no drawing has.
+"""Fabrication errors that no drawing has numbers for: index offsets and surface astigmatism.
 
 `Lens.system` takes them by name beside the lens's parameters; no lens stores them, and they are
 zero where they are not given.
@@ -13,6 +13,7 @@ zero where they are not given.
   R being the semi-diameter: the fringe Zernike terms z5 and z6 with the clear aperture as their
   disc.  The surface is out of round by 2·√(a² + b²) from peak to valley.  A test plate shows a
   fringe for each half wavelength of sag, so that one fringe at 546 nm is √(a² + b²) = 0.137 µm.
+
 """
 
 import fnmatch
@@ -24,21 +25,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.optics.materials import is_glass
-from dolens.optics.mirrors import MIRROR
+from dolens.optics.materials import MIRROR, is_glass
+from dolens.optics.surfaces.base import PackedShape, Parameters, by_names
 from dolens.optics.surfaces.conic import Conic, Sphere
-from dolens.optics.surfaces.even_asphere import EvenAsphere
-from dolens.optics.surfaces.irregular import ASTIGMATIC, Irregular
+from dolens.optics.surfaces.even_asphere import EvenAsphere, even_asphere
 from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
+from dolens.optics.surfaces.zernike import ZernikeFringe
 
 INDEX_OFFSET = "index_offset"
 ASTIGMATISMS = ("astigmatism_0", "astigmatism_45")
 _ROUND = (Plane, Sphere, Conic, EvenAsphere)
 
 
-def departures(lens: Any, patterns: Sequence[str] = ("*",)) -> dict[str, Tensor]:
+def fabrication_errors(lens: Any, patterns: Sequence[str] = ("*",)) -> dict[str, Tensor]:
     """Return what a lens may be given, by name, each zero (), in the order of the lens.
 
     A medium has an index offset where it is glass between two surfaces that refract or reflect.  A
@@ -62,7 +63,7 @@ def departures(lens: Any, patterns: Sequence[str] = ("*",)) -> dict[str, Tensor]
     return {n: zero for n in names if any(fnmatch.fnmatchcase(n, p) for p in patterns)}
 
 
-def names_departures(pattern: str) -> bool:
+def names_fabrication_errors(pattern: str) -> bool:
     """Return whether a name or pattern is one of departures, and not of parameters."""
     last = pattern.rpartition(".")[2]
     return last.startswith((INDEX_OFFSET, "astigmatism"))
@@ -77,7 +78,7 @@ def index_offsets(lens: Any, values: dict[str, Tensor]) -> tuple[Tensor | None, 
         lens: a `Lens`.
         values: by name; the offsets are taken out.
     """
-    given = departures(lens, [name for name in values if name.endswith(INDEX_OFFSET)])
+    given = fabrication_errors(lens, [name for name in values if name.endswith(INDEX_OFFSET)])
     if not given:
         return ()
     found: list[Tensor | None] = [None]
@@ -116,9 +117,48 @@ def astigmatism_of(lens: Any, number: str, values: dict[str, Tensor]) -> dict[st
     names = {f"surfaces.{number}.{name}": name for name in ASTIGMATISMS}
     if not any(name in values for name in names):
         return {}
-    known = departures(lens, list(names))
+    known = fabrication_errors(lens, list(names))
     return {own: values.pop(n) for n, own in names.items() if n in known and n in values}
 
 
 def _may_be_irregular(shape: type, parameters: Mapping[str, object]) -> bool:
     return shape in _ROUND or (shape is XYPolynomial and "b" not in parameters)
+
+
+# The terms ρ²·cos 2φ and ρ²·sin 2φ.
+ASTIGMATIC = ("z5", "z6")
+
+
+class Irregular(ZernikeFringe):
+    """The sag is that of an even asphere plus (z5·(x² - y²) + 2·z6·x·y)/normalization_radius².
+
+    It is a `ZernikeFringe` of these two terms about the vertex, for which more is known in closed
+    form: averaged over azimuth they are zero.  No prescription has it; see
+    `dolens.optics.fabrication_errors`.
+    """
+
+    kernel = ZernikeFringe.kernel
+
+    @classmethod
+    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the two terms and their slopes."""
+        square = p["normalization_radius"].square()
+        a, b = (p[name] / square for name in ASTIGMATIC)
+        slope_x, slope_y = 2.0 * (a * x + b * y), 2.0 * (b * x - a * y)
+        return 0.5 * (x * slope_x + y * slope_y), slope_x, slope_y
+
+    @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
+        """Return that of the even asphere."""
+        return EvenAsphere.paraxial_curvature(even_asphere(p))
+
+    @classmethod
+    def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
+        """Return that of the even asphere."""
+        return EvenAsphere.fourth_order_departure(even_asphere(p))
+
+    @classmethod
+    @by_names
+    def packed(cls, p: Parameters) -> PackedShape:
+        """Return what `ZernikeFringe` does."""
+        return super().packed(p)

@@ -1,18 +1,25 @@
-"""Fields that are given by where their light lands, or by the pupil that it heads for: the object
-points that belong to them.
+"""Fields and aperture of a lens, from what a prescription or a user gives.
+
+Object points follow from image heights or pupil angles.  The stop's size follows from an f-number,
+from the diameter of the entrance pupil, or from the real marginal ray.
+
 """
 
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import vergence
-from dolens.optics.rays import Rays, Status
+from dolens.optics.paraxial import matrix_to_stop, vergence
+from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 
 # The secant method needs a few steps; a distorted edge of a field some more.
 _STEPS, _HALVINGS = 60, 12
@@ -176,3 +183,91 @@ def _from_stop(lens: Lens, slope: Tensor, sense: float) -> Rays:
 
 def _arrives(status: Tensor) -> Tensor:
     return (status == Status.OK) | (status == Status.VIGNETTED)
+
+
+@torch.no_grad()
+def with_aperture(
+    lens: Lens, f_number: float | None = None, entrance_pupil_diameter: float | None = None
+) -> Lens:
+    """Return a copy of a lens whose stop makes a given pupil; the lens itself where none is given.
+
+    The stop's semi-diameter becomes the one whose paraxial image has the diameter asked for at the
+    reference wavelength.  Other apertures stay as they are, and may clip what a wider stop passes.
+
+    Args:
+        lens: the lens.
+        f_number: EFL over the diameter of the entrance pupil, both of the y-z section; or
+        entrance_pupil_diameter: mm.
+
+    Raises:
+        InputError: both are given, one is not positive, the stop is no circle, or no stop on its
+            surface makes this pupil.
+    """
+    either = {"f_number": f_number, "entrance_pupil_diameter": entrance_pupil_diameter}
+    given = {name: value for name, value in either.items() if value is not None}
+    if not given:
+        return lens
+    if len(given) > 1:
+        raise InputError("give f_number or entrance_pupil_diameter, not both")
+    ((name, target),) = given.items()
+    if not (target > 0.0 and math.isfinite(target)):
+        raise InputError(f"{name} must be positive, not {target}")
+    lens = copy.deepcopy(lens)
+    exact = copy.deepcopy(lens).to(torch.float64)
+    first = exact.first_order(lens.primary_wavelength, meridian="y")
+    diameter = abs(float(first.efl)) / target if name == "f_number" else target
+    surface = lens.surfaces[str(lens.stop)]
+    if not isinstance(surface.aperture.edge, Circle):
+        raise InputError(f"{name} needs a circular stop; surface {lens.stop} has another edge")
+    size = surface.semi_diameter * diameter / float(first.entrance_pupil.diameter)
+    if not (math.isfinite(size) and size > 0.0):
+        raise InputError(f"{name} {target:g}: no size of the stop makes this pupil")
+    try:
+        lens.stop_note = ""
+        surface.aperture = surface.aperture.resized(size)
+        surface.check_aperture()
+    except InputError as error:
+        raise InputError(f"{name} {target:g}: stop surface {lens.stop}: {error}") from None
+    return lens
+
+
+@torch.no_grad()
+def real_marginal_height(lens: Lens, paraxial: float) -> float:
+    """Return how far from the axis (mm) the real marginal ray crosses the stop, at the reference
+    wavelength and whatever the apertures are.
+
+    Args:
+        lens: its reference wavelength and object distance count.
+        paraxial: where the paraxial marginal ray crosses the stop, mm.
+
+    Raises:
+        InputError: the ray does not reach the stop.
+    """
+    system = lens.system().opened().traced_by("reference")
+    stop = system.surfaces[lens.stop - 1]
+    surfaces = list(system.surfaces)
+    surfaces[lens.stop - 1] = replace(
+        stop, aperture=replace(stop.aperture, edge=Unlimited(paraxial))
+    )
+    system = replace(system, surfaces=surfaces)
+    wavelength = lens.primary_wavelength
+    # The height at the stop is a·y + b·n·u of a ray that meets the first vertex at y with slope u.
+    (a, b), _ = matrix_to_stop(system.section("y"), wavelength).tolist()
+    if lens.object_distance is None or vergence(lens.object_distance) == 0.0:
+        start, slope = [0.0, paraxial / abs(a), 0.0], 0.0
+    else:
+        distance = float(lens.object_distance)
+        index = float(lens.materials[0].index(wavelength))
+        start, slope = [0.0, 0.0, -distance], paraxial / abs(a * distance + b * index)
+    length = math.hypot(1.0, slope)
+    position = torch.tensor([start], dtype=torch.float64)
+    direction = torch.tensor([[0.0, slope / length, 1.0 / length]], dtype=torch.float64)
+    hit = trace_rays(system, Rays(position, direction, wavelength), 1.0, True, 1, lens.stop)
+    if int(hit.status[0]) != Status.OK:
+        raise InputError(
+            "the real marginal ray, which gives the stop its size ('real_pupil'), does not reach it"
+        )
+    assert hit.points is not None  # they were recorded
+    at = hit.points[-1][0]
+    local = from_lens_axes(Components(*at, *direction[0].to(at)), system.axes[lens.stop - 1])
+    return float(torch.hypot(local.x, local.y))

@@ -1,6 +1,14 @@
-"""Samples are rays from jittered points of the sensor's pixels to strata of the exit pupil.
+"""Rays from points of the sensor's pixels to points of the exit pupil, up to the first surface.
+
+Samples are rays from jittered points of the sensor's pixels to strata of the exit pupil.
 
 It mirrors `RayRenderer._samples`, `sampling.square_to_disc` and `pupil.aim` of `dolens.rendering`.
+
+Rays of all wavelengths meet the first surface at the same points.
+
+Only refraction differs.  With d' = μ·d + Γ·N a known refraction gives the normal, N ∥ d' - μ·d;
+another wavelength's differs by (Δμ)·d + (ΔΓ)·N: no second search for the intersection.
+
 """
 
 import math
@@ -10,8 +18,31 @@ from typing import Any, NamedTuple
 
 from numba import carray, njit, types
 
-from dolens.kernels.cpu.compiler import OPTIONS
-from dolens.kernels.cpu.layout import ENDED, PATH, STATE, UNBOUNDED, VIGNETTED, L, M, N, X, Y, Z
+from dolens.kernels.cpu import jobs
+from dolens.kernels.cpu.compiler import OPTIONS, int64_at, real64_at, shifted
+from dolens.kernels.cpu.forward import real_at
+from dolens.kernels.cpu.layout import (
+    AFTER,
+    BEFORE,
+    CODE_ROW,
+    ENDED,
+    OFFSET,
+    PATH,
+    REFRACTS,
+    SHORT_RECORD,
+    STATE,
+    TAG,
+    TOTALLY_REFLECTED,
+    TRAVELLED,
+    UNBOUNDED,
+    VIGNETTED,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
 from dolens.kernels.cpu.rendering.layout import (
     ARRIVES,
     BLOCK,
@@ -32,7 +63,7 @@ from dolens.kernels.cpu.rendering.layout import (
     WEIGHT,
     WIDTH,
 )
-from dolens.kernels.cpu.rendering.random_numbers import random_words, upper_bits
+from dolens.kernels.limits import TINY
 
 
 class Sampler(NamedTuple):
@@ -151,3 +182,120 @@ def sampler(real: types.Type) -> Sampler:
         return of_z, of_pupil_z, of_radius * per_radius, of_share * per_weight
 
     return Sampler(place_pixels, sample, of_aim)
+
+
+_word = types.uint32
+_FACTOR, _SUMMAND, _HALF, _UNUSED = _word(1664525), _word(1013904223), _word(16), _word(8)
+
+
+@njit(**OPTIONS)
+def random_words(x, y, z, w):  # noqa: ANN001, ANN201
+    """Return four random words of four counters, all of 32 bits: pcg4d of Jarzynski and Olano
+    (2020).
+    """
+    x, y = _word(x * _FACTOR + _SUMMAND), _word(y * _FACTOR + _SUMMAND)
+    z, w = _word(z * _FACTOR + _SUMMAND), _word(w * _FACTOR + _SUMMAND)
+    x = _word(x + y * w)
+    y = _word(y + z * x)
+    z = _word(z + x * y)
+    w = _word(w + y * z)
+    x, y = _word(x ^ (x >> _HALF)), _word(y ^ (y >> _HALF))
+    z, w = _word(z ^ (z >> _HALF)), _word(w ^ (w >> _HALF))
+    x = _word(x + y * w)
+    y = _word(y + z * x)
+    z = _word(z + x * y)
+    w = _word(w + y * z)
+    return x, y, z, w
+
+
+@njit(**OPTIONS)
+def upper_bits(word):  # noqa: ANN001, ANN201
+    """Return the 24 upper bits of a word, as a signed integer: exact in either precision."""
+    return types.int32(word >> _UNUSED)
+
+
+# Rows that are kept: the state behind the first step at the first wavelength, with Γ in the row of
+# the path, which a renderer has no use for; then d·N, and N.
+GAMMA = PATH
+COSINE, NORMAL_X, NORMAL_Y, NORMAL_Z = (STATE + BLOCK * row for row in range(4))
+
+
+class FirstSurface(NamedTuple):
+    """These compiled functions reuse the first step of a block's rays."""
+
+    reusable: Any
+    refract_again: Any
+
+
+@cache
+def first_surface(real: types.Type) -> FirstSurface:
+    """Compile the functions for one real type."""
+    at = real_at(real)
+    zero, one, tiny = real(0.0), real(1.0), real(TINY)
+    totally_reflected = real(TOTALLY_REFLECTED)
+    # Γ² of a refraction too weak to give the normal.
+    weak = real(1e-4)
+
+    @njit(**OPTIONS)
+    def ratio(job, codes, wavelength):  # noqa: ANN001, ANN202
+        """Return the index in front of the step over that behind it."""
+        count = job[jobs.WAVELENGTHS]
+        indices = carray(real64_at(job[jobs.INDICES]), UNBOUNDED)
+        return real(
+            indices[codes[BEFORE] * count + wavelength] / indices[codes[AFTER] * count + wavelength]
+        )
+
+    @njit(**OPTIONS)
+    def reusable(job, before, kept):  # noqa: ANN001, ANN202
+        """Return whether the first wavelength's step serves the others: no ray of the block ended.
+
+        N is taken along d' - μ·d, so that Γ is positive.
+        """
+        src, dst = carray(before, STATE), carray(kept, UNBOUNDED)
+        codes = carray(int64_at(job[jobs.CODES]), CODE_ROW)
+        refracts, mu = codes[REFRACTS] != 0, ratio(job, codes, 0)
+        good = zero
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            x, y, z = dst[L + i] - mu * l, dst[M + i] - mu * m, dst[N + i] - mu * n
+            squared = x * x + y * y + z * z
+            good += one if squared > weak and dst[ENDED + i] == zero else zero
+            size = math.sqrt(squared if squared > tiny else tiny)
+            inverse = one / size
+            x, y, z = x * inverse, y * inverse, z * inverse
+            dst[GAMMA + i], dst[COSINE + i] = size, l * x + m * y + n * z
+            dst[NORMAL_X + i], dst[NORMAL_Y + i], dst[NORMAL_Z + i] = x, y, z
+        return good == real(float(BLOCK)) or not refracts
+
+    @njit(**OPTIONS)
+    def refract_again(job, wavelength, before, kept, after):  # noqa: ANN001, ANN202
+        """Set the state behind the first step at another wavelength, but for its path."""
+        src, old, dst = carray(before, STATE), carray(kept, UNBOUNDED), carray(after, STATE)
+        codes = carray(int64_at(job[jobs.CODES]), CODE_ROW)
+        record = carray(shifted(at(job[jobs.VALUES]), codes[OFFSET]), SHORT_RECORD)
+        for i in range(BLOCK):
+            dst[X + i], dst[Y + i], dst[Z + i] = old[X + i], old[Y + i], old[Z + i]
+            dst[PATH + i], dst[ENDED + i] = zero, old[ENDED + i]
+            dst[VIGNETTED + i], dst[TRAVELLED + i] = old[VIGNETTED + i], old[TRAVELLED + i]
+        if codes[REFRACTS] == 0:
+            for i in range(BLOCK * 3):
+                dst[L + i] = old[L + i]
+            return
+        total_reflection = record[TAG] + totally_reflected
+        known, mu = ratio(job, codes, 0), ratio(job, codes, wavelength)
+        change, constant, square = mu - known, one - mu * mu, mu * mu
+        # s·cos t = μ·d·N + Γ has the same sign at all wavelengths.
+        for i in range(BLOCK):
+            size, cosine = old[GAMMA + i], old[COSINE + i]
+            squared = constant + square * (cosine * cosine)
+            root = math.copysign(
+                math.sqrt(squared if squared > tiny else tiny), known * cosine + size
+            )
+            # Small changes: the normal's rounding does not count.
+            more = (root - mu * cosine) - size
+            dst[L + i] = old[L + i] + (change * src[L + i] + more * old[NORMAL_X + i])
+            dst[M + i] = old[M + i] + (change * src[M + i] + more * old[NORMAL_Y + i])
+            dst[N + i] = old[N + i] + (change * src[N + i] + more * old[NORMAL_Z + i])
+            dst[ENDED + i] = zero if squared > zero else total_reflection
+
+    return FirstSurface(reusable, refract_again)

@@ -1,4 +1,4 @@
-"""Tables of plain text cells are laid out for a terminal and for a notebook."""
+"""Tables of text cells, printed for a terminal or written as HTML for a notebook."""
 
 from collections.abc import Collection, Sequence
 

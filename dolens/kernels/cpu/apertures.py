@@ -1,4 +1,4 @@
-"""Polygons, rings and arms of spiders stop rays; see `dolens.kernels.table.Figure`."""
+"""Clear apertures made of polygons, rings and arms of spiders stop rays."""
 
 import math
 from functools import cache

@@ -1,19 +1,19 @@
-"""Units of a lens's parameters in files and configuration, known by their names.
+"""Parameters of a lens by name: their units in files, and those that belong to a state.
 
-A lens holds lengths in mm and angles in radians.  Files, configuration and tables give angles in
-degrees.  This module alone converts between the two.
+A lens holds lengths in mm and angles in radians.  Files, configuration and tables hold angles in
+degrees.  A parameter that a state has for itself is named `states.wide.thicknesses.5`.
+
 """
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from dolens.optics.departures import ASTIGMATISMS
 from dolens.optics.elements import DISPLACEMENTS, TILTS
-from dolens.optics.state_names import split_state
+from dolens.optics.fabrication_errors import ASTIGMATISMS
 
 Value = TypeVar("Value", float, Tensor)
 
@@ -96,3 +96,43 @@ def file_value(name: str, value: float) -> float | None:
         if to_lens_units(name, candidate) == value:
             return candidate
     return None
+
+
+StateValue = TypeVar("Value")
+
+# They begin with this.
+STATES = "states"
+
+
+def split_state(name: str) -> tuple[str | None, str]:
+    """Return the state that a parameter belongs to, or None, and its name there."""
+    if not name.startswith(f"{STATES}."):
+        return None, name
+    _, state, base = name.split(".", 2)
+    return state, base
+
+
+def names_of_state(lens: Any, state: str) -> set[str]:
+    """Return the names in the lens of the parameters that a state has for itself."""
+    return {f"{STATES}.{state}.{base}" for base, _ in lens.states[state].named_parameters()}
+
+
+def values_in_state(
+    lens: Any, state: str | None, values: Mapping[str, StateValue]
+) -> dict[str, StateValue]:
+    """Return those of some values that the lens in a state has, by their names there.
+
+    Args:
+        lens: the lens with its states.
+        state: None for the lens itself.
+        values: name of a parameter in the lens → value.
+    """
+    own = set() if state is None else names_of_state(lens, state)
+    hidden = {split_state(name)[1] for name in own}
+    found = {}
+    for name, value in values.items():
+        if name in own:
+            found[split_state(name)[1]] = value
+        elif not name.startswith(f"{STATES}.") and name not in hidden:
+            found[name] = value
+    return found
