@@ -1,13 +1,20 @@
-"""The contract between a run and the Lightning module that it trains and tests."""
+"""An experiment is a Lightning module with a lens: what a run asks of it.
 
-from collections.abc import Callable, Collection, Mapping
+An `Analysis` trains nothing, and iterates over `IterationData`.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import lightning
+import torch
 from matplotlib.figure import Figure
+from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
+from dolens.experiments.settings import check_count
+from dolens.experiments.tables import Row, write_table
 from dolens.optics.lens import Lens
 
 # Precisions of a trainer: single, and the network's in half where Lightning's autocast reaches it.
@@ -151,7 +158,7 @@ def check_experiment(module: Any, train: bool) -> None:
         raise InputError(
             f"module: {kind} is no experiment; derive it from "
             "dolens.experiments.experiment.Experiment, or from "
-            "dolens.experiments.analysis.Analysis if it trains nothing"
+            "dolens.experiments.experiment.Analysis if it trains nothing"
         )
     if train and not module.trains:
         raise InputError(f"train: {kind} trains nothing; set train=false")
@@ -175,3 +182,82 @@ def refuse_another(found: Any, own: Mapping[str, Any]) -> None:
                 f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
                 f"{value!r}; resume with the experiment and settings that wrote it"
             )
+
+
+class Analysis(Experiment):
+    """A lens and one computation on it, done in the test.
+
+    A subclass overrides `analyse`, and `tables` and `figures` if it has any.  See `Experiment` for
+    the arguments.
+
+    Attributes:
+        digits: significant digits of the numbers in tables.
+    """
+
+    trains: bool = False
+    digits: ClassVar[int] = 6
+
+    def analyse(self) -> Mapping[str, float]:
+        """Do the work, and return its numbers by the names that they have in metrics.json.
+
+        Gradients are enabled; a subclass that needs none decorates it with `torch.no_grad()`.
+        """
+        raise NotImplementedError(f"{type(self).__name__}.analyse")
+
+    def tables(self) -> Mapping[str, Iterable[Row]]:
+        """Return the tables: name of the file without suffix → rows; one without rows is left out.
+
+        They are written when `analyse` is done.  A long analysis may call `write_tables` whenever a
+        part of it is done; what was found is then kept if a later part fails.
+        """
+        return {}
+
+    def write_tables(self) -> None:
+        """Write `tables` as they are now to the run folder, as CSV files."""
+        if self.folder is None:
+            return
+        for name, rows in self.tables().items():
+            write_table(self.folder / f"{name}.csv", rows, self.digits)
+
+    def summary(self) -> dict[str, float]:
+        """Return the numbers that `analyse` returned; none before the test."""
+        return dict(self._numbers or {})
+
+    # ---------------------------------------------------------------- Lightning
+
+    _numbers: Mapping[str, float] | None = None
+
+    def configure_optimizers(self) -> None:
+        """Return no optimizer."""
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """Analyse, write the tables, and log the numbers."""
+        # Lightning tests in inference mode, which derivatives do not work in.
+        with torch.inference_mode(False), torch.enable_grad():
+            self._numbers = self.analyse()
+        self.write_tables()
+        self.log_dict(self.summary(), batch_size=1)
+
+
+class IterationData(lightning.LightningDataModule):
+    """`IterationData` yields the numbers of the iterations of an epoch; for a test, one.
+
+    Args:
+        iterations: steps in an epoch.
+
+    Raises:
+        InputError: fewer than one.
+    """
+
+    def __init__(self, iterations: int = 1) -> None:
+        super().__init__()
+        check_count("data.iterations", iterations)
+        self.iterations = iterations
+
+    def train_dataloader(self) -> DataLoader:
+        """Return 0, 1, 2, ..."""
+        return DataLoader(range(self.iterations), batch_size=1)
+
+    def test_dataloader(self) -> DataLoader:
+        """Return one step."""
+        return DataLoader(range(1), batch_size=1)

@@ -25,7 +25,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.as_built import MadeLens, Manufacture
-from dolens.experiments.camera.made_lens_scores import made_lens_scores
+from dolens.experiments.camera.made_lenses import made_lens_scores
 from dolens.experiments.running.finished_run import load_run
 
 _RATE = 1.0e-3

@@ -22,7 +22,7 @@ from hydra.utils import instantiate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from dolens.experiments.camera.made_images import restored_in_parts, training_images
+from dolens.experiments.camera.made_lenses import restored_in_parts, training_images
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from scripts.composed import composed

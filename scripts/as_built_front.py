@@ -26,7 +26,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from dolens.experiments.camera.made_lens_scores import worst_decile
+from dolens.experiments.camera.made_lenses import worst_decile
 from dolens.plotting import save_figure
 from dolens.plotting.tolerances import made_front_figure
 

@@ -36,9 +36,8 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.failed_parts import reason_of
-from dolens.experiments.running.machine_faults import machine_fault
-from dolens.experiments.running.plain_values import flat
+from dolens.experiments.running.faults import machine_fault, reason_of
+from dolens.experiments.running.run_files import flat
 from dolens.experiments.running.training import run
 from scripts.guarded_cases import guarded, place_of
 from tests.experiments.conftest import composing

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.experiments.running.composition import with_overrides
+from dolens.experiments.running.configuration import with_overrides
 from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.renaming import translated
 from dolens.experiments.running.run_files import info_of, metrics_of, overrides_of

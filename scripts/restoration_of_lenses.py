@@ -31,10 +31,9 @@ from dolens.experiments.data.package_photographs import (
     PackagePhotographsDataModule,
     data_folders,
 )
-from dolens.experiments.pretraining.examples import blurred
 from dolens.experiments.pretraining.pixel_functions import pixel_functions
-from dolens.experiments.pretraining.random_pupils import Draw
-from dolens.experiments.pretraining.traced_pupils import fitted_pupils, within_tolerances
+from dolens.experiments.pretraining.pretraining import blurred
+from dolens.experiments.pretraining.random_pupils import Draw, fitted_pupils, within_tolerances
 from dolens.prescriptions.files import load_lens
 from dolens.reconstruction import (
     GeneralRestoration,

@@ -20,7 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.errors import InputError
-from dolens.experiments.comparison.run import read_run
+from dolens.experiments.comparison.runs import read_run
 from dolens.plotting import save_figure
 from dolens.plotting.style import SMALL, ruled_axes
 from scripts.finished_runs import train_unless_finished

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from dolens import InputError, load_lens
 from dolens.cli.app import app
-from dolens.experiments.camera_search.forms import forms_of_run
 from dolens.experiments.data.package_photographs import read_manifest
+from dolens.experiments.lens_search.rungs import forms_of_run
 from dolens.files import read_file
 from dolens.lens_page.offenders import _read as read_tolerances
 from dolens.optics.glass_catalog import find_glass, glass_folders

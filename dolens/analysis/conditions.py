@@ -23,8 +23,9 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
-from dolens.analysis.ray_intercepts import field_unit, in_double_precision, uniform_pupil_points
+from dolens.analysis.ray_intercepts import field_unit, uniform_pupil_points
 from dolens.errors import InputError
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
@@ -277,7 +278,7 @@ _RAYS = 16
 
 @torch.no_grad()
 def full_field(lens: Lens, object_distance: float | None = None) -> float:
-    """Return the full field of a lens, degrees or mm, to three digits; see the module.
+    """Return the full field of a lens, degrees or mm, to three digits; see the head of this file.
 
     Zero where no light passes at all.
     """

@@ -7,13 +7,10 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.fields_and_wavelengths import that_count
-from dolens.analysis.ray_intercepts import (
-    in_double_precision,
-    trace_ray_intercepts,
-    uniform_pupil_points,
-)
+from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
 from dolens.analysis.spot_diagram import AIRY, moments, working_f_numbers
 from dolens.errors import InputError
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
 
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan
-from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.errors import InputError
 from dolens.optics.aiming import field_line, launch
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
-from dolens.optics.rays import Rays, Status
+from dolens.optics.rays import Rays, arrives
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def parabasal_rays(
         given = torch.rad2deg(linear.atan()) if near == 0.0 else linear
         aimed = lens.aim(given, (0.0, 0.0), waves, object_distance)
         chief = lens.trace(aimed)
-        reached = aimed.converged & _arrives(chief.status)
+        reached = aimed.converged & arrives(chief.status)
         image_rate = _rates(chief.position[..., :2], linear)
 
         q = aimed.crossing.clone().requires_grad_()
@@ -86,7 +86,7 @@ def parabasal_rays(
         line, _ = field_line(angles, object_distance)
         ray = launch(line[:, None], near, q)
         hit = lens.trace(Rays.from_components(ray, waves))
-        reached = reached & _arrives(hit.status)
+        reached = reached & arrives(hit.status)
         position = hit.position[..., :2]
         slope = hit.direction[..., :2] / hit.direction[..., 2:]
         if lens.sensor_curvature is not None:
@@ -100,10 +100,6 @@ def parabasal_rays(
         return values.detach().where(there, torch.nan).cpu()
 
     return ParabasalRays(*map(found, (position, slope, *rates, image_rate)))
-
-
-def _arrives(status: Tensor) -> Tensor:
-    return (status == Status.OK) | (status == Status.VIGNETTED)
 
 
 def _rates(values: Tensor, inputs: Tensor) -> Tensor:

@@ -6,13 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import (
-    field_unit,
-    in_double_precision,
-    launch_through_stop,
-    uniform_pupil_points,
-)
+from dolens.analysis.ray_intercepts import field_unit, launch_through_stop, uniform_pupil_points
 from dolens.optics.elements import from_lens_axes
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Status

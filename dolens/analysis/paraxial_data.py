@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import Conditions, full_field, wavelength_interval
-from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.analysis.spot_diagram import AIRY
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence

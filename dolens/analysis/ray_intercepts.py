@@ -6,7 +6,6 @@ rays start at values of the polynomial.  Each is exactly a ray of its field.  Th
 moves its crossing of the stop by some 1e-4 of the stop's semi-diameter or less.
 """
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from torch import Tensor
 from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_line, launch
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import vignetting_margin
 from dolens.optics.image_surface import TangentPlanes
 from dolens.optics.lens import Lens
@@ -215,11 +215,6 @@ def _along_surface(
 def field_unit(object_distance: float | None) -> str:
     """Return the unit of field coordinates: `°` for an object at infinity, else `mm`."""
     return "°" if vergence(object_distance) == 0.0 else "mm"
-
-
-def in_double_precision(lens: Lens) -> Lens:
-    """Return the lens, or a copy of it in double precision where it is not."""
-    return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)
 
 
 def _fitted(

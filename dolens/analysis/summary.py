@@ -15,8 +15,8 @@ from dolens.analysis.paraxial_data import (
     first_order_numbers,
     seidel_sums,
 )
-from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.analysis.spot_diagram import spot_diagram
+from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import point_text, weights_text
 from dolens.optics.lens import Lens
 from dolens.optics.text_tables import html_table, printable, text_table

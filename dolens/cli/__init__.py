@@ -1,1 +1,1 @@
-"""The command `dolens`: one file for each of its commands."""
+"""The command `dolens` and its commands."""

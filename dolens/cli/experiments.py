@@ -58,7 +58,7 @@ def _show_one(name: str, folders: list[Path], as_json: bool) -> None:
 
     found = experiment(name, folders)
     module = import_extra(
-        "dolens.experiments.running.experiment_parts", "train", "dolens experiments NAME"
+        "dolens.experiments.running.user_configuration", "train", "dolens experiments NAME"
     )
     parts = module.parts_of(name)
     command = f"dolens train experiment={name}"

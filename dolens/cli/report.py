@@ -67,7 +67,7 @@ def report(
     if list_systems:
         _list(plan)
         return
-    results = import_extra(f"{_PACKAGE}.results", "train", "dolens report")
+    results = import_extra(f"{_PACKAGE}.runs", "train", "dolens report")
     session = import_extra(f"{_PACKAGE}.session", "train", "dolens report")
     names = tuple(name for entry in only or () for name in entry.split(",") if name)
     given = results.assigned(plan, runs or ())
@@ -130,7 +130,7 @@ class _Progress:
         if finish.status == 0:
             self.console.print(f"{self.line}: done in {took}", markup=False, soft_wrap=True)
             return
-        runner = import_extra(f"{_PACKAGE}.runner", "train", "dolens report")
+        runner = import_extra(f"{_PACKAGE}.runs", "train", "dolens report")
         self.console.print(
             f"{self.line}: FAILED after {took} with status {finish.status}; {finish.log} ends with",
             markup=False,
@@ -181,5 +181,5 @@ def _summary(made: Any) -> bool:
 
 
 def _duration(seconds: float) -> str:
-    numbers = import_extra(f"{_PACKAGE}.page.numbers", "train", "dolens report")
+    numbers = import_extra(f"{_PACKAGE}.page.overview", "train", "dolens report")
     return numbers.seconds_text(seconds)

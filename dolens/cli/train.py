@@ -13,13 +13,6 @@ from typer.core import TyperCommand
 
 from dolens.cli.extras import import_extra
 from dolens.errors import InputError
-from dolens.experiments.running.catalogue import (
-    added_folders,
-    configuration_folders,
-    experiments,
-    groups,
-    meanings,
-)
 from dolens.threads import choose_waiting
 
 
@@ -34,7 +27,7 @@ class PassedOn(TyperCommand):
 
 def complete(ctx: typer.Context, incomplete: str) -> list[str]:
     """Return what an argument may become, for a shell: groups, options, settings, values."""
-    module = import_extra("dolens.experiments.running.completion", "train", "dolens train")
+    module = import_extra("dolens.experiments.running.user_configuration", "train", "dolens train")
     return module.completions(ctx.params.get("arguments") or [], incomplete)
 
 
@@ -96,9 +89,11 @@ def show_help(arguments: Sequence[str], program: str) -> None:
         arguments: of the command line; `--config-dir` adds a folder.
         program: how the user called it.
     """
+    from dolens.experiments.running import catalogue  # the other commands need none of it
+
     console = Console(highlight=False)
     command = f"python {program}" if program.endswith(".py") else program
-    folders = [*configuration_folders(Path.cwd()), *added_folders(arguments)]
+    folders = [*catalogue.configuration_folders(Path.cwd()), *catalogue.added_folders(arguments)]
     console.print(f"\n[bold]Usage:[/] {command} experiment=NAME \\[KEY=VALUE ...] \\[OPTIONS]\n")
     console.print(
         "Run an experiment: train a camera, design a lens, find its tolerances or its pose. "
@@ -117,12 +112,12 @@ def show_help(arguments: Sequence[str], program: str) -> None:
     _heading(console, "Options")
     console.print(_columns([(f"[bold]{option}[/]", meaning) for option, meaning in _OPTIONS]))
     _heading(console, "Experiments (dolens experiments: what each does, costs and writes)")
-    names = ", ".join(found.name for found in experiments(folders))
+    names = ", ".join(found.name for found in catalogue.experiments(folders))
     console.print(Padding(f"[dim]{names}[/]", (0, 2)))
     _heading(console, "Groups and their options")
-    known = meanings(folders)
+    known = catalogue.meanings(folders)
     rows = []
-    for group, options in groups(folders).items():
+    for group, options in catalogue.groups(folders).items():
         if group != "experiment":
             meaning = f"{known[group]}\n" if group in known else ""
             rows.append((f"[bold]{group}[/]", f"{meaning}[dim]{', '.join(options)}[/]"))

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor
 
 from dolens.diffraction.entrance_beam import ObjectPoints
@@ -329,6 +328,8 @@ def transfer_functions(
         (W, Q), complex, 1 at zero; and the same without aberrations.
     """
     count = pupil.amplitude.shape[-1]
+    from scipy.fft import next_fast_len  # slow to load, and plotting loads this module
+
     size = next_fast_len(2 * count)
     steps = pupil.cosines[..., 1] - pupil.cosines[..., 0]
     # A cell that passes a share c has amplitude c, but flux c and not c²: the autocorrelation at

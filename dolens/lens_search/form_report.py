@@ -1,7 +1,7 @@
 """A form is reported: its powers, colour errors, checks, sensitivity to tolerances, and files.
 
-The tolerances are those of `dolens.tolerancing.tolerances`, whose lengths are scaled to the lens.  The
-spots of lenses as they would be made come from the linear ray model: no lens is traced again.
+The tolerances are those of `dolens.tolerancing.tolerances`, whose lengths are scaled to the lens.
+The spots of lenses as they would be made come from the linear ray model: no lens is traced again.
 """
 
 from collections.abc import Sequence

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.lens_search.form_coordinates import (
-    FormArrays,
     FormCoordinates,
     form_coordinates,
     is_reversible,
@@ -225,16 +224,3 @@ def _coordinates(lenses: Sequence[Lens], turned: Sequence[bool] | None = None) -
         torch.cat([each.numbers for each in found]),
         torch.cat([each.whole for each in found]),
     )
-
-
-__all__ = [
-    "TOLERANCE",
-    "Form",
-    "FormArrays",
-    "FormCoordinates",
-    "distinct",
-    "form_coordinates",
-    "form_distances",
-    "form_numbers",
-    "lens_distance",
-]

@@ -15,7 +15,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.ray_tracing import trace_rays
-from dolens.optics.rays import Status
+from dolens.optics.rays import arrives
 from dolens.optics.surfaces.clear_aperture import Unlimited
 
 # Field heights from the axis to the edge, and rays through the stop, besides those on its rim.
@@ -102,8 +102,7 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     launched = launch_through_stop(lens, scan.fields, waves, pupil, where.object_distance)
     hit = trace_rays(system, launched.rays, 1.0, True)
     assert hit.points is not None  # they were recorded
-    arrives = (hit.status == Status.OK) | (hit.status == Status.VIGNETTED)
-    failed = ~(arrives & launched.started)
+    failed = ~(arrives(hit.status) & launched.started)
     passes = hit.valid & launched.started
     points = torch.cat([hit.points, hit.position[None]])
     kept = passes.expand(points.shape[:-1])

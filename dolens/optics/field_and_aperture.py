@@ -18,7 +18,7 @@ from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import matrix_to_stop, vergence
 from dolens.optics.ray_tracing import trace_rays
-from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.rays import Components, Rays, Status, arrives
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 
 # The secant method needs a few steps; a distorted edge of a field some more.
@@ -96,7 +96,7 @@ def _of_real_rays(lens: Lens, heights: Tensor) -> Tensor:
     ray = _from_stop(lens, slope, -1.0)
     if lens.stop > 1:
         back = lens.sensor_to_scene(ray, last=lens.stop - 1)
-        if not bool(_arrives(back.status).all()):
+        if not bool(arrives(back.status).all()):
             raise InputError("a chief ray of a real image height does not come from the object")
         ray = Rays(back.position, back.direction, ray.wavelength)
         if bool((ray.direction[..., 2] >= 0.0).any()):
@@ -125,7 +125,7 @@ def _slopes_at_stop(lens: Lens, radius: Tensor) -> Tensor:
     def landing(slope: Tensor) -> Tensor:
         """Return y on the sensor, NaN where the ray is lost."""
         hit = lens.trace(_from_stop(lens, slope, 1.0), first=lens.stop)
-        return torch.where(_arrives(hit.status), hit.position[..., 1], torch.nan)
+        return torch.where(arrives(hit.status), hit.position[..., 1], torch.nan)
 
     rate = float(landing(radius.new_full((1,), _SMALL))[0]) / _SMALL
     if not (math.isfinite(rate) and rate != 0.0):
@@ -179,10 +179,6 @@ def _from_stop(lens: Lens, slope: Tensor, sense: float) -> Rays:
     direction = sense * torch.stack((zero, slope, torch.ones_like(slope)), -1)
     direction = direction / direction.norm(dim=-1, keepdim=True)
     return Rays(torch.stack((zero, zero, z), -1), direction, lens.primary_wavelength)
-
-
-def _arrives(status: Tensor) -> Tensor:
-    return (status == Status.OK) | (status == Status.VIGNETTED)
 
 
 @torch.no_grad()

@@ -264,7 +264,6 @@ def _pairs(text: str) -> tuple[tuple[float, float], ...]:
 
 
 VARIABLE = "DOLENS_GLASS"
-_NM_PER_UM_OF_AGF = 1000.0
 # The largest catalogue of a maker has 2 MB.
 _LARGEST = 32 * 2**20
 # Set for as long as a lens is read or written, by `glass_folders`.
@@ -337,7 +336,7 @@ def user_glass(catalogue: str, entry: AgfEntry) -> Glass:
         InputError: its numbers cannot be read (see `dolens.optics.agf.read_entry`).
     """
     glass = read_entry(entry)
-    first, last = (round(_NM_PER_UM_OF_AGF * end, 6) for end in glass.wavelengths)
+    first, last = (round(_NM_PER_UM * end, 6) for end in glass.wavelengths)
     return Glass(
         f"{catalogue}:{glass.name}",
         *glass.dispersion,

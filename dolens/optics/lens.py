@@ -332,8 +332,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         """Trace rays from the object through every surface to the sensor, plane or curved.
 
         With backend `auto`, fast kernels trace many rays, and PyTorch a few, so that these wait for
-        no compiler; see `dolens.optics.ray_tracing.is_few`.  Results agree to rounding.  A loop over
-        few rays is faster with the kernels: set `backend` to `cpu`.
+        no compiler; see `dolens.optics.ray_tracing.is_few`.  Results agree to rounding.  A loop
+        over few rays is faster with the kernels: set `backend` to `cpu`.
 
         Args:
             rays: travelling with the light in the medium before surface `first`: towards +z, or

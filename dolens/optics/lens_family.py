@@ -22,7 +22,7 @@ from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import IndexMap, SurfaceTable, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
-from dolens.optics.rays import Rays, Status, TracedRays
+from dolens.optics.rays import Rays, TracedRays, arrives
 
 
 @dataclass(frozen=True)
@@ -406,8 +406,7 @@ def intercept_parts(
         part = replace(table, values=table.values[rows], indices=table.indices[rows])
         own = rays.of_each(len(part.values))
         position, _, _, status, _ = trace(part, (own.position, own.direction, column))
-        arrives = (status == int(Status.OK)) | (status == int(Status.VIGNETTED))
-        yield rows, position[..., :2], arrives
+        yield rows, position[..., :2], arrives(status)
 
 
 @torch.no_grad()

@@ -23,6 +23,11 @@ class Status(IntEnum):
     MISSED = 3
 
 
+def arrives(status: Tensor) -> Tensor:
+    """Return which rays reach the sensor where nothing clips them: OK and VIGNETTED, of any shape."""
+    return (status == Status.OK) | (status == Status.VIGNETTED)
+
+
 # mm; distances along rays are held there, since infinity times zero is NaN.  A ray that meets a
 # surface comes nowhere near it, and sums of several stay in single precision.
 OUT_OF_REACH = 1e35

@@ -236,9 +236,10 @@ def bounded_steps(model: BatchModel, damping: Tensor, lower: Tensor, upper: Tens
     """Return damped steps within their boxes, (n, P): each the minimum of a convex problem.
 
     Which variables end on a bound is found by block principal pivoting, as in
-    `dolens.optimize.linear_least_squares`: guess the set, solve for the rest, and exchange every variable
-    that contradicts the guess; after some turns only the last one of them (Murty's rule).  The rare
-    problem that is not solved within the turns that are allowed has its step put back into the box.
+    `dolens.optimize.linear_least_squares`: guess the set, solve for the rest, and exchange every
+    variable that contradicts the guess; after some turns only the last one of them (Murty's rule).
+    The rare problem that is not solved within the turns that are allowed has its step put back into
+    the box.
 
     Args:
         model: of n problems.

@@ -12,7 +12,6 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from scipy.special import j0, j1
 from torch import Tensor
 
 from dolens.analysis.encircled_energy import EncircledEnergy
@@ -242,6 +241,8 @@ def encircled_energy_figure(
                 handles.append(Line2D([], [], color=colour, linewidth=1.6, label=label))
     if given and math.isfinite(given[0].airy_radius_um):
         radius = np.linspace(0.0, reach, 400)
+        from scipy.special import j0, j1  # slow to load, and all of plotting loads this file
+
         x = math.pi * AIRY * radius / given[0].airy_radius_um
         style: dict[str, Any] = {"color": "black", "linewidth": 0.9}
         axes.plot(radius, 1.0 - j0(x) ** 2 - j1(x) ** 2, zorder=2, gid="perfect", **style)

@@ -146,7 +146,7 @@ def value_and_error(value: float, sigma: float) -> tuple[str, str]:
 
 # The share of a figure's width that titles may take.  Those of axes stand over the axes' middle,
 # which labels at the left push aside.
-_TITLE_SHARE, _AXES_TITLE_SHARE = 0.98, 0.82
+_FIGURE_SHARE, _AXES_TITLE_SHARE = 0.98, 0.82
 # Height of a line over the size of its text.
 _LEADING = 1.3
 _POINTS_PER_INCH = 72.0
@@ -164,7 +164,7 @@ def draw_title(figure: Figure, text: str | None, size: float = TITLE) -> None:
         size: of the text, points of 1/72 inch.
     """
     if text:
-        added = _fit(figure.suptitle(text, fontsize=size), _TITLE_SHARE * figure.bbox.width)
+        added = _fit(figure.suptitle(text, fontsize=size), _FIGURE_SHARE * figure.bbox.width)
         _grow(figure, added, size)
 
 
@@ -210,7 +210,6 @@ def _width(title: Text, line: str) -> float:
 
 
 # The share of a figure's width that a legend may take.
-_LEGEND_SHARE = 0.98
 
 
 def legend_below(
@@ -240,7 +239,7 @@ def legend_below(
             fontsize=SMALL,
             markerscale=marker_scale,
         )
-        fits = legend.get_window_extent().width <= _LEGEND_SHARE * figure.bbox.width
+        fits = legend.get_window_extent().width <= _FIGURE_SHARE * figure.bbox.width
         if fits or columns <= 1:
             return legend
         legend.remove()

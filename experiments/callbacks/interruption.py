@@ -1,13 +1,19 @@
-"""A notice to the user when a run stops early."""
+"""Callbacks end a run that has no finite numbers or no objective, and tell how a run goes on."""
 
 import logging
 import shlex
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning
+import torch
+from torch import Tensor
 
-from dolens.experiments.running.override_text import override_text
-from dolens.experiments.search.pruned import TrialPruned
+from dolens.errors import InputError
+from dolens.experiments.running.command_line import override_text
+from dolens.experiments.running.run_settings import no_metric
+from dolens.experiments.search.pruning import TrialPruned
 
 logger = logging.getLogger(__name__)
 
@@ -51,3 +57,149 @@ class InterruptionNotice(lightning.Callback):
                 trainer.global_step,
                 type(exception).__name__,
             )
+
+
+# So many names are in a message.
+_NAMED = 4
+
+
+class FiniteTraining(lightning.Callback):
+    """Ends a training whose loss, gradient or state is not finite.
+
+    The loss and its gradient are looked at before the optimizer moves anything by them, and the
+    state before a checkpoint is written: the checkpoints of a run are finite.  Where a search makes
+    its own steps, as of least squares, it takes back by itself what is not finite, and its state
+    alone is looked at.
+
+    Args:
+        skipped_steps: how many steps in a row may be left out, with a warning, where loss or
+            gradient is not finite.  One more ends the run.
+
+    Raises:
+        InputError: a number below 0.
+    """
+
+    def __init__(self, skipped_steps: int = 0) -> None:
+        if skipped_steps < 0:
+            raise InputError(f"callbacks.finite: skipped_steps {skipped_steps}; allowed: 0 or more")
+        self.skipped_steps = skipped_steps
+        self._in_a_row = 0
+        self._fault = ""
+        self._unset: set[str] = set()
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Note what is not finite as training begins, as a best merit that nothing reached yet."""
+        self._unset = set(_not_finite(pl_module.state_dict().items()))
+
+    def on_before_backward(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, loss: Tensor
+    ) -> None:
+        """Look at the loss.
+
+        Raises:
+            InputError: it is not finite, and no further step may be left out.
+        """
+        if not pl_module.automatic_optimization or bool(torch.isfinite(loss.detach()).all()):
+            return
+        logged = trainer.callback_metrics
+        terms = [f"{n} {float(logged[n])}" for n in _not_finite(logged.items()) if "train/" in n]
+        self._fault = f"the loss is not finite ({', '.join(terms) or float(loss.detach())})"
+        self._refuse_if_too_many(trainer)
+
+    def on_before_optimizer_step(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        optimizer: torch.optim.Optimizer,
+    ) -> None:
+        """Look at the gradient, and drop it where the step is left out.
+
+        Raises:
+            InputError: it is not finite, and no further step may be left out.
+        """
+        # Where losses are scaled up for half precision, the scaler leaves out what overflows.
+        scaled = getattr(trainer.precision_plugin, "scaler", None) is not None
+        if not pl_module.automatic_optimization or scaled:
+            return
+        if not self._fault:
+            gradients = ((n, p.grad) for n, p in pl_module.named_parameters() if p.grad is not None)
+            names = _not_finite(gradients)
+            if not names:
+                self._in_a_row = 0
+                return
+            self._fault = f"the gradient is not finite (of {_listed(names)})"
+            self._refuse_if_too_many(trainer)
+        logger.warning("Step %d is left out: %s", trainer.global_step + 1, self._fault)
+        # What has no gradient stays as it is, whatever momentum it has.
+        optimizer.zero_grad(set_to_none=True)
+        self._in_a_row, self._fault = self._in_a_row + 1, ""
+
+    def _refuse_if_too_many(self, trainer: lightning.Trainer) -> None:
+        if self._in_a_row < self.skipped_steps:
+            return
+        find = getattr(trainer.datamodule, "training_photographs", None)
+        names = [] if find is None else list(dict.fromkeys(find()))
+        of = f", photographs {_listed(names)}" if names else ""
+        after = f" for {self._in_a_row + 1} steps in a row" if self._in_a_row else ""
+        raise InputError(
+            f"step {trainer.global_step + 1}{of}: {self._fault}{after}; nothing moved by it, and "
+            "the checkpoints are those before it (lower learning_rates, or allow "
+            "callbacks.finite.skipped_steps)"
+        )
+
+    def on_save_checkpoint(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        checkpoint: dict[str, Any],
+    ) -> None:
+        """Look at the state.
+
+        Raises:
+            InputError: a part of it that was finite is not any more.
+        """
+        names = [n for n in _not_finite(checkpoint["state_dict"].items()) if n not in self._unset]
+        if names and trainer.training:
+            raise InputError(
+                f"step {trainer.global_step}: {_listed(names)} is not finite any more; no "
+                "checkpoint is written of it, and those before it stay"
+            )
+
+
+def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
+    """Return the names of the tensors that have a number that is not finite."""
+    return [name for name, value in tensors if not bool(torch.isfinite(value).all())]
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"
+
+
+class LoggedObjectives(lightning.Callback):
+    """Looks for a run's objectives among the metrics of the first validation.
+
+    Args:
+        objectives: names of metrics; those that do not begin with `val/` come from elsewhere.
+    """
+
+    def __init__(self, objectives: Sequence[str]) -> None:
+        self._wanted = [name for name in objectives if name.startswith("val/")]
+
+    def on_validation_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Look, once.
+
+        Raises:
+            InputError: the validation has logged no such metric.
+        """
+        if trainer.sanity_checking:
+            return
+        there = sorted(name for name in trainer.callback_metrics if name.startswith("val/"))
+        for name in self._wanted:
+            if name not in there:
+                raise no_metric(name, there)
+        self._wanted = []

@@ -10,33 +10,36 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.experiments.camera.adversary import Adversary
 from dolens.experiments.camera.as_built import AsBuilt, manufacture_of
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.calibration import check as check_miscalibrations
-from dolens.experiments.camera.costs import StepCosts
+from dolens.experiments.camera.camera_figures import camera_figures
 from dolens.experiments.camera.evaluation import (
     Evaluation,
+    behind_line,
     check_size,
+    gain_line,
     means_of,
     photographs_of_crops,
     without_loss,
 )
-from dolens.experiments.camera.figures import camera_figures
-from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
-from dolens.experiments.camera.made_images import restored_in_parts, training_images
-from dolens.experiments.camera.made_lens_scores import (
+from dolens.experiments.camera.lens_merit import CameraOperands
+from dolens.experiments.camera.lens_optimizer import LensSteps, variable_numbers
+from dolens.experiments.camera.made_lenses import (
     MadeLensScores,
     made_lens_scores,
     made_lenses_figure_of,
+    restored_in_parts,
+    training_images,
 )
-from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import compile_network
-from dolens.experiments.camera.restoration_gain import behind_line, gain_line
-from dolens.experiments.camera.settings import Reconstruction, Training
-from dolens.experiments.camera.training_parts import (
+from dolens.experiments.camera.training import (
+    Adversary,
+    Reconstruction,
+    StepCosts,
+    Training,
     check_sharing,
     parameter_groups,
     summary_numbers,

@@ -1,10 +1,11 @@
-"""Scores of a camera on photographs: by its renderer, by other judges, with wrong calibrations."""
+"""Scores of a camera on photographs, beside untrained restorers and with wrong calibrations."""
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,14 +13,25 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
-from dolens.experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
-from dolens.experiments.camera.untrained_rivals import restored_by_rivals, rival_names
+from dolens.experiments.camera.photograph_scores import (
+    PhotographScores,
+    format_interval,
+    scores_by_photograph,
+    statistics_of,
+)
 from dolens.experiments.camera.views.base import Views, seed_of
-from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.reconstruction import (
+    WienerBM3DRestoration,
+    WienerTVRestoration,
+    psnr_db,
+    structural_similarity,
+)
 from dolens.reconstruction.processes import gathered
-from dolens.reconstruction.quality import SIMILARITY_WINDOW
+from dolens.reconstruction.quality import SIMILARITY_WINDOW, Interval, gain_interval
+from dolens.reconstruction.untrained import bm3d_is_installed
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.noise import generator_of
+from dolens.sensor.pixels import Sensor
 from dolens.tasks import stage as named_stage
 
 # Stage → metric → number of a batch → scores (B, V).
@@ -249,3 +261,124 @@ def together(rows: Rows) -> Rows:
 def _compared(measure: object, image: Tensor, truth: Tensor) -> Tensor:
     found = measure(image.flatten(0, 1), truth.flatten(0, 1).to(image.dtype))
     return found.unflatten(0, truth.shape[:2])
+
+
+# By what names of scores begin with, and what these restorers are called.
+RIVALS = {
+    "tv": "Wiener's filter and total variation, which nothing has trained",
+    "bm3d": "Wiener's filter and BM3D, which nothing has trained",
+}
+# Pixels along each side: on smaller images the package bm3d may end the whole program.
+_LEAST_BM3D = 32
+_MADE = {"tv": WienerTVRestoration, "bm3d": WienerBM3DRestoration}
+
+
+def rival_names(sensor: Sensor) -> list[str]:
+    """Return the keys of `RIVALS` that this installation has, for images of a sensor's size."""
+    small = min(sensor.height, sensor.width) < _LEAST_BM3D
+    return [name for name in RIVALS if name != "bm3d" or (bm3d_is_installed() and not small)]
+
+
+@torch.no_grad()
+def restored_by_rivals(
+    camera: Camera, taken: Views, functions: Tensor | None, values: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return images (B, V, 3, H, W), display-encoded, by the name of who restored them.
+
+    They know what a network may know: the sensor's noise, and the point spread functions of each
+    image's own place where a camera knows it, else of all views.
+
+    Args:
+        camera: whose images they are.
+        taken: what the sensor gave.
+        functions: that the camera's network was told; None where it asks for none.
+        values: of the lens's variables.
+    """
+    if functions is None or functions.ndim == taken.given.ndim:  # not of each image its own
+        own = camera.views.functions_of_images(camera.lens, values, taken, "test")
+        functions = functions if own is None else own
+    if functions is None:
+        functions = camera.views.point_spread_functions(camera.lens, values)
+    rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
+    noise = torch.tensor(camera.views.noise)
+    return {
+        name: rival(taken.given, functions, None, noise).unflatten(0, taken.raw.shape[:2])
+        for name, rival in rivals.items()
+    }
+
+
+# Gains by their names: over which scores of the same test they are, and what those are of.
+OVER = {
+    "gain_over_filter_db": ("linear_psnr_db", "the network's own linear filter"),
+    "gain_over_raw_db": ("raw_psnr_db", "the sensor's image"),
+    "gain_over_plain_db": ("plain_psnr_db", "the plain lens in one exposure, restored alike"),
+    **{f"gain_over_{name}_db": (f"{name}_psnr_db", said) for name, said in RIVALS.items()},
+}
+
+
+class RestorationGain(NamedTuple):
+    """The PSNR of restored images less that of simpler pictures, dB.
+
+    Attributes:
+        name: in `OVER`.
+        view: its label, `worst`, or empty for the mean.
+        interval: 95 %, over photographs, paired.
+    """
+
+    name: str
+    view: str
+    interval: Interval
+
+
+def restoration_gains(scores: PhotographScores, views: Sequence[str]) -> Iterator[RestorationGain]:
+    """Yield the gains of one test.
+
+    At the worst view the gain is that of the worst view of either: they may be two.
+
+    Args:
+        scores: of the test.
+        views: labels, `worst`, or empty for the mean over the views; see `statistics_of`.
+    """
+    statistics = statistics_of(scores.views)
+    for name, (other, _) in OVER.items():
+        if other not in scores.metrics:
+            continue
+        sides = [scores.metrics[metric].double()[None] for metric in ("psnr_db", other)]
+        for view in views:
+            interval = gain_interval(*sides, statistics[view], torch.Generator().manual_seed(0))
+            yield RestorationGain(name, view, interval)
+
+
+def gain_numbers(scores: PhotographScores, stage: str) -> dict[str, float]:
+    """Return gains and the ends of their intervals, by the names of metrics: of the mean over the
+    views, each view, and the worst.
+    """
+    numbers = {}
+    for gain in restoration_gains(scores, list(statistics_of(scores.views))):
+        key = f"{stage}/{gain.name}" + (f"/{gain.view}" if gain.view else "")
+        found = gain.interval
+        numbers |= {key: found.estimate}
+        numbers |= {f"error/{key}/low": found.low, f"error/{key}/high": found.high}
+    return numbers
+
+
+def gain_line(scores: PhotographScores) -> str:
+    """Return a sentence that says the gains at the worst view, with their intervals."""
+    said = [
+        f"{format_interval(gain.interval, 2)} dB over {OVER[gain.name][1]}"
+        for gain in restoration_gains(scores, ["worst"])
+    ]
+    return (
+        f"Restored images at the worst of {', '.join(scores.views)}: {'; '.join(said)} "
+        f"({len(scores.photographs)} photographs, 95 % intervals)"
+    )
+
+
+def behind_line(scores: PhotographScores) -> str | None:
+    """Return a sentence that says which untrained restorers are ahead at the worst view, if any."""
+    ahead = [
+        f"{format_interval(gain.interval, 2)} dB over {OVER[gain.name][1]}"
+        for gain in restoration_gains(scores, ["worst"])
+        if gain.name in {f"gain_over_{name}_db" for name in RIVALS} and gain.interval.estimate < 0.0
+    ]
+    return f"The network is behind untrained restorers: {'; '.join(ahead)}" if ahead else None

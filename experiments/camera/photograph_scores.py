@@ -1,4 +1,4 @@
-"""Scores of a test by photograph: means, confidence intervals, and the table of a run."""
+"""Scores of a test by photograph, their intervals, and the gain of one camera over another."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.tables import Row
-from dolens.reconstruction.quality import Interval, bootstrap_interval
+from dolens.reconstruction.quality import Interval, bootstrap_interval, gain_interval
 
 
 def table_name(stage: str = "test") -> str:
@@ -138,3 +138,45 @@ def format_interval(interval: Interval, digits: int) -> str:
         return f"{interval.estimate:+.{digits}f}"
     low, high = f"{interval.low:+.{digits}f}", f"{interval.high:+.{digits}f}"
     return f"{interval.estimate:+.{digits}f} [{low}, {high}]"
+
+
+def paired_gain(
+    scores: Sequence[PhotographScores | None],
+    against: Sequence[PhotographScores | None],
+    metric: str,
+    view: str,
+) -> Interval | None:
+    """Return the mean gain with its 95 % interval over photographs, and over seeds if several.
+
+    The resamples are the same at every call.
+
+    Args:
+        scores: of the camera whose gain it is, one entry a seed.
+        against: of the camera that it is compared with, for the same seeds.
+        metric: as `psnr_db`.
+        view: the label of a view, as `worst`; empty for the mean over the views.
+
+    Returns:
+        None where the runs kept no scores of the same photographs in the same views, or no such
+        metric or view.
+    """
+    if not _comparable([*scores, *against], metric, view):
+        return None
+    sides = (torch.stack([run.metrics[metric] for run in side]) for side in (scores, against))
+    statistic = statistics_of(scores[0].views)[view]
+    return gain_interval(*sides, statistic, torch.Generator().manual_seed(0))
+
+
+def _comparable(scores: Sequence[PhotographScores | None], metric: str, view: str) -> bool:
+    """Return whether scores are of the same photographs in the same views, with the metric."""
+    first = scores[0]
+    return (
+        first is not None
+        and view in statistics_of(first.views)
+        and all(
+            run is not None
+            and (run.photographs, run.views) == (first.photographs, first.views)
+            and metric in run.metrics
+            for run in scores
+        )
+    )

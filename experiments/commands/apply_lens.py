@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.experiments.commands.applied import (
+from dolens.experiments.commands.apply_options import LensOptions
+from dolens.experiments.commands.pictures import (
     Applied,
     apply_to_files,
     check_files,
@@ -19,7 +20,6 @@ from dolens.experiments.commands.applied import (
     picture_of,
     written,
 )
-from dolens.experiments.commands.apply_options import LensOptions
 from dolens.optics.lens import Lens
 from dolens.prescriptions import load_lens
 from dolens.reconstruction import GeneralRestoration

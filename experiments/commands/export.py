@@ -10,9 +10,8 @@ from omegaconf import OmegaConf
 
 from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.base import Camera
-from dolens.experiments.camera.exportable import exportable
 from dolens.experiments.camera.network_export import FORMATS as NETWORK_FORMATS
-from dolens.experiments.camera.network_export import export_onnx, export_torch
+from dolens.experiments.camera.network_export import export_onnx, export_torch, exportable
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
 from dolens.manufacturing.lens_export import FORMATS as LENS_FORMATS

@@ -1,10 +1,11 @@
-"""A comparison of runs: its rows, metrics and gains; as Markdown, CSV, plain data and a figure."""
+"""Runs are compared by metrics and paired gains: as Markdown, CSV, plain data and a figure."""
 
 import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,18 +13,22 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from dolens.errors import InputError
-from dolens.experiments.camera.photograph_scores import format_interval
-from dolens.experiments.comparison.found import FoundRuns, find_runs
-from dolens.experiments.comparison.gains import gain_of
-from dolens.experiments.comparison.labels import metric_label, setting_label
-from dolens.experiments.comparison.metrics import (
+from dolens.experiments.camera.photograph_scores import format_interval, paired_gain
+from dolens.experiments.comparison.rows import (
+    Row,
+    Rows,
     Value,
     chosen_metrics,
+    chosen_row,
     digits_of,
+    metric_label,
     objectives,
+    rows_of,
+    setting_label,
+    text_of,
     value_of,
 )
-from dolens.experiments.comparison.rows import Row, Rows, chosen_row, rows_of, text_of
+from dolens.experiments.comparison.runs import FoundRuns, Run, find_runs
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
 from dolens.plotting.style import with_minus
 from dolens.reconstruction.quality import Interval
@@ -277,3 +282,51 @@ def _numbers(value: Value | None) -> tuple[Any, ...]:
     if value is None:
         return ("",) * 4
     return value.mean, value.half_range, value.low, value.high
+
+
+def gain_of(row: Row, against: Row, metric: str) -> Interval | None:
+    """Return the gain of a row over another one in a metric.
+
+    Args:
+        row: which gains.
+        against: over which.
+        metric: full name; for `test/psnr_db/worst` and the like, scores of photographs pair runs.
+
+    Returns:
+        The difference over the seeds that both have, with its 95 % interval over seeds and
+        photographs; the interval is NaN where the runs kept no scores of the same photographs.
+        None where there is no such seed, or a run has no such metric.
+    """
+    if metric.startswith("test/"):
+        name, _, view = metric.removeprefix("test/").partition("/")
+        return gain(row.runs, against.runs, name, view)
+    return gain(row.runs, against.runs, metric, None)
+
+
+def gain(
+    group: Mapping[int, Run], against: Mapping[int, Run], metric: str, view: str | None
+) -> Interval | None:
+    """Return the gain of runs in a view over the seeds that both have; None without such seeds.
+
+    Args:
+        group: seed → run.
+        against: likewise.
+        metric: as `psnr_db`.
+        view: as `worst`; empty for the mean over the views; None: `metric` is a full name.
+    """
+    key = metric if view is None else f"test/{metric}/{view}".rstrip("/")
+    seeds = sorted(
+        seed
+        for seed in group.keys() & against.keys()
+        if key in group[seed].metrics and key in against[seed].metrics
+    )
+    if not seeds:
+        return None
+    runs = [group[seed] for seed in seeds], [against[seed] for seed in seeds]
+    if view is not None:
+        scores = ([run.scores for run in side] for side in runs)
+        found = paired_gain(*scores, metric, view)
+        if found is not None:
+            return found
+    means = [statistics.mean(run.metrics[key] for run in side) for side in runs]
+    return Interval(means[0] - means[1], float("nan"), float("nan"), len(seeds), 0)

@@ -1,11 +1,13 @@
-"""Runs become rows: one for all that differ in nothing but the seed, with what tells rows apart."""
+"""Runs that differ in the seed alone become a row, with its settings and mean metrics."""
 
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
-from dolens.errors import InputError
-from dolens.experiments.comparison.run import Run
+from dolens.errors import InputError, did_you_mean
+from dolens.experiments.comparison.runs import Run
 
 
 @dataclass(frozen=True)
@@ -218,3 +220,166 @@ def _selected(rows: Rows, wanted: str) -> list[Row]:
             text_of(row.settings.get(full.get(key, key), _MISSING)) == value for key, value in pairs
         )
     ]
+
+
+# Beside the objective, where runs have them.
+_MAIN = (
+    "test/psnr_db/worst",
+    "test/psnr_db",
+    "test/ssim",
+    "test/raw_psnr_db",
+    "cost/step_s",
+    "cost/wall_s",
+)
+
+
+@dataclass(frozen=True)
+class Value:
+    """The `Value` of a metric in a row.
+
+    Attributes:
+        mean: over the seeds.
+        half_range: over the seeds; 0 for one seed.
+        count: of seeds.
+        low: lower end of the run's own 95 % interval over photographs; None where the row has
+            several seeds, or the run gives none.
+        high: upper end likewise.
+    """
+
+    mean: float
+    half_range: float
+    count: int
+    low: float | None = None
+    high: float | None = None
+
+    def text(self) -> str:
+        """Return the mean ± half the range, or the value with its interval."""
+        digits = digits_of(self.mean)
+        mean = f"{self.mean:.{digits}f}" if digits is not None else f"{self.mean:.3g}"
+        if self.count > 1:
+            spread = (
+                f"{self.half_range:.{digits}f}"
+                if digits is not None
+                else (f"{self.half_range:.2g}")
+            )
+            return f"{mean} ± {spread}"
+        if self.low is not None and self.high is not None and digits is not None:
+            return f"{mean} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+        return mean
+
+
+def digits_of(value: float) -> int | None:
+    """Return how many decimals a number is shown with; None where it needs an exponent."""
+    size = abs(value)
+    if size != 0.0 and not 1e-3 <= size < 1e6:
+        return None
+    return 0 if size >= 1000 else 1 if size >= 100 else 2 if size >= 10 else 3 if size >= 0.1 else 4
+
+
+def value_of(row: Row, metric: str) -> Value | None:
+    """Return a metric of a row; None where a run of it does not have it."""
+    values = row.values(metric)
+    if not values or len(values) < len(row.runs):
+        return None
+    mean, half_range = statistics.mean(values), 0.5 * (max(values) - min(values))
+    if len(values) > 1:
+        return Value(mean, half_range, len(values))
+    metrics = next(iter(row.runs.values())).metrics
+    ends = (metrics.get(f"error/{metric}/{end}") for end in ("low", "high"))
+    return Value(mean, half_range, 1, *ends)
+
+
+def chosen_metrics(rows: Rows, wanted: Sequence[str] = ()) -> list[str]:
+    """Return the metrics of a comparison.
+
+    Args:
+        rows: of the comparison.
+        wanted: names, patterns (`test/psnr_db/*`), or what stands behind `test/` (`psnr_db`: that
+            of all views); none: the objective, the main scores of a test, and costs.
+
+    Raises:
+        InputError: a name that no run has.
+    """
+    metrics = _of_all(rows)
+    if not wanted:
+        return [name for name in dict.fromkeys((*objectives(rows), *_MAIN)) if name in metrics]
+    found: dict[str, None] = {}
+    for pattern in wanted:
+        of_test = (f"test/{pattern}", f"test/{pattern}/*")
+        matched = [m for m in metrics if fnmatchcase(m, pattern)] or [
+            m for m in metrics if any(fnmatchcase(m, p) for p in of_test)
+        ]
+        if not matched:
+            raise InputError(
+                f"--metrics: no run has '{pattern}'{did_you_mean(pattern, metrics)} "
+                "(metrics.json of a run has all names)"
+            )
+        found.update(dict.fromkeys(matched))
+    return list(found)
+
+
+def objectives(rows: Rows) -> list[str]:
+    """Return the metrics that the runs returned, without those that no run has."""
+    metrics = _of_all(rows)
+    named = (n for row in rows.rows for run in row.runs.values() for n in run.objectives)
+    return [name for name in dict.fromkeys(named) if name in metrics]
+
+
+def _of_all(rows: Rows) -> Mapping[str, None]:
+    runs = (run for row in rows.rows for run in row.runs.values())
+    return {name: None for run in runs for name in _in_order(run.metrics)}
+
+
+def _in_order(metrics: Mapping[str, float]) -> list[str]:
+    """Return names with the worst view behind the others, as reports have it."""
+    return sorted(
+        metrics, key=lambda name: (name.rpartition("/")[0], name.endswith("/worst"), name)
+    )
+
+
+_WORDS = {"psnr": "PSNR", "ssim": "SSIM", "rms": "RMS", "efl": "EFL", "mtf": "MTF"}
+_UNITS = {
+    **{"db": "dB", "um": "µm", "mm": "mm", "nm": "nm", "s": "s", "mb": "MB", "deg": "°"},
+    **{"grey_levels": "grey levels", "pixels": "pixels"},
+}
+# By the last part of a setting's name; lens files and configurations share these units.
+_SETTINGS = {
+    **dict.fromkeys(
+        (
+            *("radius", "thickness", "semi_diameter", "stop_semi_diameter", "distance"),
+            *("diameter", "pixel_pitch", "decenter_x", "decenter_y", "shift_z", "depths"),
+        ),
+        "mm",
+    ),
+    **dict.fromkeys(("curvature", "curvature_x", "curvature_y"), "1/mm"),
+    **dict.fromkeys(("tilt_x", "tilt_y", "tilt_z"), "°"),
+    **dict.fromkeys(("wavelength", "wavelengths"), "nm"),
+    "light": "electrons in white",
+}
+
+
+def metric_label(name: str) -> str:
+    """Return a metric in words: `test/psnr_db/worst` is `test PSNR, worst (dB)`."""
+    unit = ""
+    parts = []
+    for part in name.split("/"):
+        for suffix, symbol in _UNITS.items():
+            if part.endswith(f"_{suffix}"):
+                part, unit = part.removesuffix(f"_{suffix}"), f" ({symbol})"
+                break
+        parts.append(" ".join(_WORDS.get(word, word) for word in part.split("_")))
+    if parts[0] == "test" and len(parts) > 1:
+        parts[:2] = [f"test {parts[1]}"]
+    return ", ".join(parts) + unit
+
+
+def setting_label(name: str) -> str:
+    """Return a setting in words: `lens.surfaces.1.radius` is `radius of surface 1 (mm)`."""
+    parts = name.split(".")
+    last = parts[-1]
+    unit = f" ({_SETTINGS[last]})" if last in _SETTINGS else ""
+    if len(parts) > 2 and parts[-3] == "surfaces":
+        return f"{last.replace('_', ' ')} of surface {parts[-2]}{unit}"
+    if parts[-2:] == ["sensor", "distance"]:
+        return f"sensor distance{unit}"
+    return f"{name}{unit}"

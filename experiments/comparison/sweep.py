@@ -1,7 +1,9 @@
-"""A sweep writes its own comparison when its last job has ended."""
+"""A sweep writes its own comparison, and the command that repeats its best run."""
 
 import logging
+import math
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,11 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from dolens.errors import InputError
-from dolens.experiments.comparison.best import best_lines
 from dolens.experiments.comparison.comparison import compared, csv_of, figure_of, markdown_of
-from dolens.experiments.comparison.found import run_folders
-from dolens.experiments.comparison.run import read_unfinished
-from dolens.experiments.running.run_files import has_metrics, is_given_up
+from dolens.experiments.comparison.runs import Run, read_unfinished, run_folders
+from dolens.experiments.running.command_line import command
+from dolens.experiments.running.run_files import has_metrics, is_given_up, overrides_of
+from dolens.experiments.search.settings import BY_MODE, MAXIMIZE, direction_of
 from dolens.plotting import save_figure
 
 logger = logging.getLogger(__name__)
@@ -68,3 +70,44 @@ def write_comparison(folder: Path) -> None:
     logger.info("Comparison of the sweep: %s", folder / "comparison.md")
     for line in best:
         logger.info("%s", line)
+
+
+def best_lines(runs: Sequence[Run]) -> list[str]:
+    """Return a line for each objective of some runs: its best value, and the command for that.
+
+    Args:
+        runs: that are finished; of several objectives, each has a line of its own.
+    """
+    names = dict.fromkeys(name for run in runs for name in run.objectives)
+    return [line for name in names for line in _line(name, runs)]
+
+
+def _line(objective: str, runs: Iterable[Run]) -> Iterable[str]:
+    own = [
+        run
+        for run in runs
+        if objective in run.objectives and math.isfinite(run.metrics.get(objective, math.nan))
+    ]
+    if not own:
+        return
+    direction = direction_of(objective) or _of_checkpoints(objective, own[0])
+    if direction is None:
+        yield f"Whether more of {objective} is better is not known: see the table for the best job"
+        return
+    choose = max if direction == MAXIMIZE else min
+    best = choose(own, key=lambda run: run.metrics[objective])
+    repeat = command(overrides_of(best.folder))
+    yield (
+        f"The best {objective}, {best.metrics[objective]:.6g}, has {best.folder}; "
+        f"to repeat it: {repeat}"
+    )
+
+
+def _of_checkpoints(objective: str, run: Run) -> str | None:
+    """Return the direction by which the run chose its best checkpoint, if that is the same score.
+
+    A score of the user's own is so known: `test/<score>` is that of `val/<score>`.
+    """
+    monitor = str(run.values.get("callbacks.best.monitor", ""))
+    same = objective.partition("/")[2] == monitor.partition("/")[2] != ""
+    return BY_MODE.get(str(run.values.get("callbacks.best.mode"))) if same else None

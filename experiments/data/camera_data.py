@@ -9,11 +9,16 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
-from dolens.experiments.checks import check_count
-from dolens.experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
-from dolens.experiments.data.loading import CropLoader, Waiting
+from dolens.experiments.data.crop_loading import (
+    CropLoader,
+    EvaluationCrops,
+    ResumableLoader,
+    ResumableSampler,
+    TrainingCrops,
+    Waiting,
+)
 from dolens.experiments.data.photographs import Photograph
-from dolens.experiments.data.resumable import ResumableLoader, ResumableSampler
+from dolens.experiments.settings import check_count
 
 Split = Literal["train", "validation", "test"]
 

@@ -1,29 +1,32 @@
-"""Photographs are read from any folder of images."""
+"""Photographs are read from any folder of images, with depth maps beside them or without."""
 
 import hashlib
 import logging
 import math
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from dolens.errors import InputError, check_choice
 from dolens.experiments.data.camera_data import CropDataModule, Split
 from dolens.experiments.data.folder_index import SOUND, FolderIndex, IndexedFiles
-from dolens.experiments.data.folder_photographs import FolderPhotographs
-from dolens.experiments.data.headers import with_headers
-from dolens.experiments.data.index_files import IndexFile
+from dolens.experiments.data.index_files import IndexFile, with_headers
 from dolens.experiments.data.photographs import (
     EXTENSIONS,
+    FolderPhotographs,
     Photograph,
     normalised_extensions,
     read_photograph,
 )
-from dolens.sensor.image_files import MEGAPIXELS
+from dolens.sensor.image_files import MEGAPIXELS, read_numbers
 
 _log = logging.getLogger(__name__)
 
@@ -266,3 +269,125 @@ class ImageFolderDataModule(CropDataModule):
             digest.update(name.replace(_SEPARATOR, b"/"))
             digests += digest.digest()
         return np.frombuffer(digests, dtype=">u8") / 2.0**64
+
+
+class RgbdFolderDataModule(ImageFolderDataModule):
+    """`RgbdFolderDataModule` cuts crops of photographs with depth (mm) as a fourth channel, for
+    `scene=layers`.
+
+    Beside each photograph lies its depth map: `hall.jpg` and `hall_depth.png`.
+
+    Args:
+        root: the folder, searched recursively; split as `ImageFolderDataModule` says.
+        depth_suffix: ending of a depth map's name after the photograph's.
+        depth_unit: mm per unit of the maps' numbers: 1 for millimetres (Kinect), 1000 for metres,
+            0.2 for the TUM benchmark's 5000 a metre.
+        **settings: those of `ImageFolderDataModule`.
+
+    Raises:
+        InputError: an argument is out of range; at set-up, a photograph has no depth map.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        depth_suffix: str = "_depth",
+        depth_unit: float = 1.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        if not depth_suffix:
+            raise InputError("data.depth_suffix: empty; allowed: such as _depth")
+        if not 0.0 < depth_unit < math.inf:
+            raise InputError(f"data.depth_unit: {depth_unit}; allowed: mm per unit, above 0")
+        self.depth_suffix, self.depth_unit = depth_suffix, float(depth_unit)
+
+    def load_split(self, split: Split) -> FolderPhotographs:
+        """Return the photographs of a split with their depths, none of them decoded yet."""
+        read = partial(
+            _read, suffix=self.depth_suffix, unit=self.depth_unit, megapixels=self.megapixels
+        )
+        return self._photographs_of(split, read)
+
+    def _wanted(self, index: FolderIndex) -> np.ndarray:
+        """Return photographs alone, each of which must have a depth map."""
+        paths = {number: index.folder / name for number, name in enumerate(index.names)}
+        photographs = [n for n, p in paths.items() if not is_depth_map(p, self.depth_suffix)]
+        missing = [
+            paths[n] for n in photographs if depth_map_of(paths[n], self.depth_suffix) is None
+        ]
+        if missing:
+            first = missing[0]
+            raise InputError(
+                f"{first}: no depth map beside it (nor beside {len(missing) - 1} others); allowed: "
+                f"{first.stem}{self.depth_suffix} with the ending {', '.join(ENDINGS)}"
+            )
+        return np.array(photographs, dtype=np.int32)
+
+
+def _read(path: Path, suffix: str, unit: float, megapixels: float) -> Photograph:
+    """Read a photograph and its depth map."""
+    photograph = read_photograph(path, megapixels=megapixels)
+    beside = depth_map_of(path, suffix)
+    if beside is None:
+        raise InputError(f"{path}: its depth map is no longer there")
+    depth = read_depth_map(beside, unit, megapixels)
+    return replace(photograph, depth=depth)
+
+
+ENDINGS = (".npy", ".png", ".tif", ".tiff")
+"""Endings of depth maps, in the order in which they are looked for."""
+
+
+def depth_map_of(photograph: Path, suffix: str) -> Path | None:
+    """Return the depth map beside a photograph: `hall.jpg` has `hall_depth.png`, for `_depth`; or
+    None.
+    """
+    for ending in ENDINGS:
+        path = photograph.with_name(f"{photograph.stem}{suffix}{ending}")
+        if path.is_file():
+            return path
+    return None
+
+
+def is_depth_map(path: Path, suffix: str) -> bool:
+    """Return whether a file's name is that of a depth map."""
+    return path.stem.endswith(suffix) and path.suffix.lower() in ENDINGS
+
+
+def read_depth_map(path: Path, unit: float, megapixels: float = MEGAPIXELS) -> Tensor:
+    """Read a depth map in mm, (height, width), float32, with holes filled.
+
+    Numbers that are zero, negative or not finite are holes, as depth cameras leave them in the
+    shadows that near things cast on far ones: each takes the largest depth on its border.
+
+    Args:
+        path: a grey image of integers or floating-point numbers, or an array that numpy saved.
+        unit: mm per unit of its numbers.
+        megapixels: the largest that is read, millions of pixels.
+
+    Raises:
+        InputError: the file cannot be read, has several channels, or no depth at all.
+    """
+    values = read_numbers(path, megapixels=megapixels)
+    if values.ndim != 2:
+        raise InputError(
+            f"{path}: {values.dtype} of shape {values.shape}; allowed: a depth map of one channel, "
+            "integers or floating-point numbers"
+        )
+    depth = torch.from_numpy(values.astype(np.float32)) * unit
+    known = torch.isfinite(depth) & (depth > 0.0)
+    if not bool(known.any()):
+        raise InputError(f"{path}: no depth above 0; allowed: at least one")
+    return _filled(torch.where(known, depth, 0.0))
+
+
+def _filled(depth: Tensor) -> Tensor:
+    """Replace zeros by the largest depth on the border of their hole."""
+    hole = depth == 0.0
+    while True:
+        around = max_pool2d(depth[None], 3, stride=1, padding=1)[0]
+        filled = torch.where(hole, around, depth)
+        if torch.equal(filled, depth):
+            return depth
+        depth = filled

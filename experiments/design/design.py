@@ -13,24 +13,24 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
-from dolens.experiments.checks import check_positive
-from dolens.experiments.design.figures import design_figures, history_figures
+from dolens.experiments.design.design_figures import design_figures, history_figures, state_figures
 from dolens.experiments.design.iteration import (
     Progress,
     gradient_iteration,
     least_squares_iteration,
 )
-from dolens.experiments.design.light import fit_edges, refuse_lost_light
-from dolens.experiments.design.state_figures import state_figures
+from dolens.experiments.design.spot_tables import iteration_row, spot_metrics
 from dolens.experiments.design.states import (
     entrance_pupils,
+    fit_edges,
     foci,
+    refuse_lost_light,
     set_entrance_pupils,
     set_foci,
     state_metrics,
 )
-from dolens.experiments.design.tables import iteration_row, spot_metrics
 from dolens.experiments.experiment import Experiment, Figures
+from dolens.experiments.settings import check_positive
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue

@@ -1,16 +1,20 @@
-"""A design of a lens with states: the lens in each of them, its pupils, edges and spots."""
+"""A lens that is designed, in each of its states: pupils, edges, lost light, and spots."""
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from dolens.experiments.design.tables import SpotTable, spot_metrics, spot_table
+from dolens.errors import InputError
+from dolens.experiments.design.spot_tables import SpotTable, spot_labels, spot_metrics, spot_table
 from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters, rim_rays
+from dolens.optimize.image_quality import ImageQuality
 
 logger = logging.getLogger(__name__)
 
@@ -167,3 +171,58 @@ def set_foci(lens: Lens, names: list[str], distances: Tensor) -> None:
     """Store distances of the sensor that `foci` has returned."""
     for name, distance in zip(names, distances.reshape(-1), strict=True):
         lens.get_parameter(name).copy_(distance)
+
+
+# Rings of the quadrature that tells where the edges of the beams are.
+_EDGE_RINGS = 40
+# Factor of the heights of beams that pass an edge untouched.
+_BESIDE = 1.005
+
+
+def fit_edges(lens: Lens, initial: Lens | None, settings: MeritSettings) -> None:
+    """Put every edge of a lens where the light of its beams meets it.
+
+    Args:
+        lens: its clear apertures are replaced.
+        initial: decides which rays there are, those that pass it; None: those that the lens's own
+            stop lets pass, aimed at its rim, with a little room beside all others.
+        settings: fields and wavelengths of the rays.
+    """
+    settings = replace(
+        settings,
+        sampling="gaussian_quadrature",
+        sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
+    )
+    edges = {}
+    for state in settings.states_of(lens) or (None,):
+        there = lens.in_state(state)
+        if initial is not None:
+            rays = settings.rays(initial.in_state(state))
+            edges[state] = fitted_semi_diameters(there, rays)
+            continue
+        own = rim_rays(there, settings.fields_of(there), settings.wavelengths_of(there))
+        edges[state] = fitted_semi_diameters(there, own, _BESIDE)
+        edges[state].pop(str(lens.stop), None)
+    set_edges(lens, edges)
+
+
+def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:
+    """Check that no spot has lost too much light since a search began.
+
+    Each round takes its rays from the lens as it then is, so that every one could lose some.
+
+    Args:
+        quality: that of the present round.
+        initial_light: (S,), the light of its spots when the search began; see `SpotRays.light`.
+
+    Raises:
+        InputError: a spot has lost more than `max_vignetting` of its light.
+    """
+    least = initial_light * (1.0 - quality.max_vignetting)
+    lost = quality.spots.light < least.to(quality.spots.light)
+    if bool(lost.any()):
+        label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
+        raise InputError(
+            f"spot {label} has lost more than merit.max_vignetting = "
+            f"{quality.max_vignetting:g} of the light that it had at first"
+        )

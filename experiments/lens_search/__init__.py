@@ -1,1 +1,1 @@
-"""Searches for lenses as experiments."""
+"""Searches for lenses, and for cameras made of their forms, as experiments."""

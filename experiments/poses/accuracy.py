@@ -15,24 +15,21 @@ from torch import Tensor
 
 from dolens.alignment.information import fisher_information
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.experiment import Figures
+from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
-from dolens.experiments.poses.accuracy_settings import (
-    BasinSettings,
-    ComparedImages,
-    PhotonLevels,
-    RayCounts,
-)
 from dolens.experiments.poses.accuracy_tasks import (
     ESTIMATORS,
     AccuracyModel,
     AtTruth,
+    Basin,
+    BasinSettings,
+    ComparedImages,
+    PhotonLevels,
+    RayCounts,
     errors_by_photons,
     errors_by_rays,
     linearised,
 )
-from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.bench import Bench, Light, check_precision
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of

@@ -8,8 +8,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from dolens.alignment.pose import Pose
-from dolens.experiments.poses.basin import Basin
-from dolens.experiments.poses.labels import variable_label
+from dolens.experiments.poses.accuracy_tasks import Basin
+from dolens.experiments.poses.pose_figures import variable_label
 from dolens.experiments.tables import Row
 from dolens.plotting.style import (
     PAGE,

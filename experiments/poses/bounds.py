@@ -15,9 +15,7 @@ from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.experiment import Figures
-from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
+from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.bench import (
     Bench,
     Light,
@@ -26,14 +24,9 @@ from dolens.experiments.poses.bench import (
     repetitions,
     simulate,
 )
-from dolens.experiments.poses.bounds_figures import bounds_figures
-from dolens.experiments.poses.results import spread_metrics
-from dolens.experiments.poses.settings import (
-    ImageSettings,
-    blur_for,
-    slopes_imager,
-    values_imager,
-)
+from dolens.experiments.poses.fit_plan import ImageSettings, blur_for, slopes_imager, values_imager
+from dolens.experiments.poses.pose_figures import UNSEEN, Arrangement, bounds_figures
+from dolens.experiments.poses.pose_results import spread_metrics
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens

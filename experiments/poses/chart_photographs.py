@@ -15,43 +15,37 @@ from dolens.alignment.chart_photons import ChartLight
 from dolens.alignment.spot_moments import one_thread
 from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.errors import InputError
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.checks import check_count, numbers_of
-from dolens.experiments.experiment import Figures
+from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.bench import check_precision
-from dolens.experiments.poses.chart_figures import (
-    coverage_figure,
-    intervals_figure,
-    marks_figure,
-    restoration_figure,
-)
 from dolens.experiments.poses.chart_restoration import Judged, judged
 from dolens.experiments.poses.chart_result import (
     FittedSpecimen,
     combination_rows,
+    coverage_figure,
     coverage_metrics,
     fit_metrics,
     gain_metrics,
     gain_rows,
+    intervals_figure,
+    marks_figure,
     prescription_rows,
+    restoration_figure,
     specimen_rows,
 )
-from dolens.experiments.poses.chart_settings import (
+from dolens.experiments.poses.chart_simulation import (
     CameraPriors,
     ChartEffects,
     Restoration,
-    Windows,
-    photograph_settings,
-    spread_evenly,
-)
-from dolens.experiments.poses.chart_simulation import (
     Specimen,
+    Windows,
     drawn,
+    photograph_settings,
     read_windows,
     simulated,
+    spread_evenly,
     with_numbers,
 )
-from dolens.experiments.settings import PupilRays
+from dolens.experiments.settings import PupilRays, check_count, numbers_of
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.system import require_plane_sensor

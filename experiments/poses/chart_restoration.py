@@ -11,8 +11,8 @@ from torch import Tensor
 from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, Chart
 from dolens.alignment.chart_model import BLUR, ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
-from dolens.experiments.data.photos import TEST, VALIDATION, read_installed
-from dolens.experiments.poses.chart_settings import Restoration
+from dolens.experiments.data.package_photographs import TEST, VALIDATION, read_installed
+from dolens.experiments.poses.chart_simulation import Restoration
 from dolens.reconstruction.wiener import transfer_function, wiener_deconvolve
 from dolens.rendering.psf import bin_rays
 from dolens.sensor.colour import srgb_to_linear

@@ -14,12 +14,19 @@ from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.errors import check_choice
 from dolens.experiments.experiment import Experiment, Figures
-from dolens.experiments.poses.bench import Bench, Light, check_precision, repetitions
-from dolens.experiments.poses.estimates import Estimates, estimates, held_numbers
-from dolens.experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
-from dolens.experiments.poses.misalignment_figures import misalignment_figures
-from dolens.experiments.poses.observations import Observations
-from dolens.experiments.poses.results import (
+from dolens.experiments.poses.bench import Bench, Light, Observations, check_precision, repetitions
+from dolens.experiments.poses.fit_plan import FitPlan, values_imager
+from dolens.experiments.poses.fitting import (
+    Estimates,
+    estimates,
+    held_numbers,
+    iterate,
+    loss_of,
+    optimizer_of,
+    slopes_of,
+)
+from dolens.experiments.poses.pose_figures import misalignment_figures
+from dolens.experiments.poses.pose_results import (
     error_over_bound,
     history_row,
     pose_metrics,
@@ -27,7 +34,6 @@ from dolens.experiments.poses.results import (
     spread_columns,
     spread_metrics,
 )
-from dolens.experiments.poses.settings import FitPlan, values_imager
 from dolens.experiments.tables import Row, write_table
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens

@@ -1,10 +1,12 @@
-"""Identification of the misaligned element of a lens from its spots."""
+"""The misaligned element of a lens is identified from its spots."""
 
 import copy
 import logging
+import math
 import time
-from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -19,21 +21,119 @@ from dolens.alignment.element_fit import (
     most_likely_element,
     simulated_moments,
 )
-from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
-from dolens.errors import InputError
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.checks import check_count, check_positive
-from dolens.experiments.experiment import Figures
-from dolens.experiments.poses.alignment_checks import one_exposure_error, sampling_error
-from dolens.experiments.poses.alignment_figures import Setup, alignment_figure
-from dolens.experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
-from dolens.experiments.poses.alignment_settings import Detector, Misalignments
-from dolens.experiments.settings import PupilRays, Spots
+from dolens.alignment.moments import Pixels, grid_error
+from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.experiments.experiment import Analysis, Figures
+from dolens.experiments.poses.alignment_result import (
+    COLUMNS,
+    SENSOR_COLUMNS,
+    Alignment,
+    Setup,
+    alignment_figure,
+)
+from dolens.experiments.settings import PupilRays, Spots, check_count, check_finite, check_positive
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_names import DEGREE, unit_of
+from dolens.optics.parameter_names import DEGREE, unit_factors, unit_of
 from dolens.plotting.layout import lens_title
 from dolens.tasks import stage as named_stage
+
+
+@dataclass(frozen=True)
+class Detector:
+    """The detector that counts the photons of the spots.
+
+    Attributes:
+        pixel_pitch: mm; 0: every photon is located exactly, and nothing is read.
+        read_noise: electrons RMS of a pixel.
+        window: half of the side of the square that a spot is summed over, in its RMS radii.
+
+    Raises:
+        InputError: a number out of range, or read noise without pixels.
+    """
+
+    pixel_pitch: float
+    read_noise: float
+    window: float
+
+    def __post_init__(self) -> None:
+        if self.pixel_pitch == 0.0 and self.read_noise != 0.0:
+            raise InputError(f"read_noise: {self.read_noise!r}; allowed: 0 where pixel_pitch is 0")
+        self.pixels()
+
+    def pixels(self) -> Pixels | None:
+        """Return the pixels; None for an ideal detector."""
+        if self.pixel_pitch == 0.0:
+            return None
+        return Pixels(self.pixel_pitch, self.read_noise, self.window)
+
+
+@dataclass(frozen=True)
+class Misalignments:
+    """The simulated lenses: one that is known, and a number of random ones.
+
+    Attributes:
+        demo: the first lens: `element`, and any of `tilt_x`, `tilt_y` (degrees), `decenter_x`,
+            `decenter_y` (mm); its sensor's place is random.
+        count: random lenses: elements are equally likely, tilts and decentres uniform.
+        tilt_range: half-range of the tilts about x and y, degrees.
+        decenter_range: half-range of the decentres, mm.
+        sensor_shift_range: half-range of the sensor's place in x and in y, mm; 0: it is known.
+        focus_range: half-range of the sensor's place along the axis, mm; 0: it is known.
+        seed: of the lenses and of noise.
+
+    Raises:
+        InputError: a number out of range, or an unknown key of `demo`.
+    """
+
+    demo: Mapping[str, Any]
+    count: int
+    tilt_range: float
+    decenter_range: float
+    sensor_shift_range: float
+    focus_range: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        check_count("misalignments", self.count)
+        check_positive("tilt_range", self.tilt_range)
+        check_positive("decenter_range", self.decenter_range)
+        for key in ("sensor_shift_range", "focus_range"):
+            number = getattr(self, key)
+            if not 0.0 <= number < math.inf:
+                raise InputError(f"{key}: {number!r}; allowed: a positive number, or 0 if known")
+        check_keys(self.demo, ("element", *POSE), "demo")
+        for name in POSE:
+            check_finite(f"demo.{name}", self.demo.get(name, 0.0))
+
+    def unknown_of_sensor(self) -> list[str]:
+        """Return the names of the sensor's coordinates that are unknown to the fits."""
+        return [name for name, half_range in self._places().items() if half_range > 0.0]
+
+    def half_range(self) -> Tensor:
+        """Return the half-ranges of tilts (radians), decentres and unknown coordinates (mm)."""
+        tilt, shift = self.tilt_range, self.decenter_range
+        pose = torch.tensor([tilt, tilt, shift, shift], dtype=torch.float64) * unit_factors(POSE)
+        places = [float(half_range) for half_range in self._places().values() if half_range > 0.0]
+        return torch.cat([pose, torch.tensor(places, dtype=torch.float64)])
+
+    def known_case(self, elements: Sequence[str]) -> tuple[int, Tensor]:
+        """Return the demo's element (its number) and pose (4,), in radians and mm.
+
+        Raises:
+            InputError: it names none of the elements.
+        """
+        name = self.demo.get("element")
+        check_choice(name, elements, "demo.element")
+        values = [float(self.demo.get(part, 0.0)) for part in POSE]
+        pose = torch.tensor(values, dtype=torch.float64) * unit_factors(POSE)
+        return list(elements).index(name), pose
+
+    def _places(self) -> dict[str, float]:
+        shift = self.sensor_shift_range
+        return dict(zip(SENSOR, (shift, shift, self.focus_range), strict=True))
+
 
 logger = logging.getLogger(__name__)
 
@@ -219,3 +319,55 @@ def _information_roots(
         if len(mine):
             roots[mine] = information_root(model, measured[mine], true[mine])
     return roots
+
+
+# Places of the pixels' grid that are tried.
+_PLACES = 16
+
+
+def sampling_error(
+    fitted: MomentModel, simulated: MomentModel, errors: Tensor, measured: MeasuredMoments
+) -> dict[str, float]:
+    """Return the difference of moments by two quadratures of the same pupil, over their noise.
+
+    Args:
+        fitted: the model that is fitted.
+        simulated: the one that is measured.
+        errors: (K, P), of the lenses, in the lens's units.
+        measured: K measurements.
+    """
+    difference = fitted.moments(errors, measured.origin) - simulated.moments(
+        errors, measured.origin
+    )
+    apart = measured.over_noise(difference)
+    return {
+        "alignment/sampling_error_over_noise": float(apart.square().mean().sqrt()),
+        "alignment/sampling_error_over_noise/largest": float(apart.abs().max()),
+    }
+
+
+def one_exposure_error(
+    dense: MomentModel, pixels: Pixels, errors: Tensor, measured: MeasuredMoments
+) -> dict[str, float]:
+    """Return what one exposure instead of many dithered ones would change, over the noise.
+
+    Places of the pixels' grid under the spots form a lattice.
+
+    Args:
+        dense: a model of many rays a pixel, without pixels.
+        pixels: what counts the light.
+        errors: (1, P), of one lens, in the lens's units.
+        measured: its measurement.
+    """
+    side = (torch.arange(math.isqrt(_PLACES)) + 0.5) / math.isqrt(_PLACES)
+    places = torch.cartesian_prod(side, side)
+    difference = grid_error(
+        dense.points(errors)[0],
+        dense.shares,
+        measured.origin[0],
+        dense.size,
+        pixels.pitch,
+        places,
+    )
+    apart = measured.over_noise(difference[:, None])
+    return {"alignment/pixel_grid_over_noise": float(apart.square().mean().sqrt())}

@@ -1,4 +1,4 @@
-"""Checks of runs against a file of expected values."""
+"""Runs are checked against a file of expected values."""
 
 import enum
 import math
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from dolens.errors import InputError, check_choice
 from dolens.experiments.report.plan import FOLDER, Plan, read_yaml
+from dolens.experiments.report.runs import Result
 from dolens.typed_values import call_with_settings
 
 # kind of an expected value → what it rests on
@@ -131,3 +132,35 @@ def _outcome(check: Check, metrics: Mapping[str, float] | None) -> Outcome:
     if value is None:
         return Outcome(check, State.FAILS, None, "the run has no such metric")
     return Outcome(check, State.HOLDS if check.holds_for(value) else State.FAILS, value)
+
+
+@dataclass(frozen=True)
+class Material:
+    """The plan with all that was found.
+
+    Attributes:
+        plan: systems and items.
+        results: finished runs by the names of their systems.
+        comparisons: numbers of each comparison that could be made.
+        outcomes: of all checks.
+        failed: systems whose run ended with an error → its last words.
+        made: when and by which version, one line.
+        code: the fingerprint of the present code.
+    """
+
+    plan: Plan
+    results: Mapping[str, Result]
+    comparisons: Mapping[str, Mapping[str, float]]
+    outcomes: Sequence[Outcome]
+    failed: Mapping[str, str]
+    made: str
+    code: str
+
+    def metrics(self, run: str) -> Mapping[str, float] | None:
+        """Return the metrics of a system or comparison, or None where there are none."""
+        result = self.results.get(run)
+        return result.metrics if result else self.comparisons.get(run)
+
+    def outcomes_of(self, item: str) -> list[Outcome]:
+        """Return the outcomes of an item's checks."""
+        return [outcome for outcome in self.outcomes if outcome.check.item == item]

@@ -1,16 +1,25 @@
-"""Makes the report: runs what is missing, one system after another, and writes the page."""
+"""The report is made: what is missing is run, one system after another, and the page written."""
 
-from collections.abc import Mapping, Sequence
+import datetime
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from dolens.experiments.report.assemble import assemble
-from dolens.experiments.report.checks import Outcome, load_checks
+import dolens
+from dolens.experiments.report.checks import Material, Outcome, load_checks, outcomes
+from dolens.experiments.report.page.page import page
 from dolens.experiments.report.plan import Plan, System
-from dolens.experiments.report.progress import Pace
-from dolens.experiments.report.results import RECORD
-from dolens.experiments.report.runner import Finish, is_current, last_words, run_system
+from dolens.experiments.report.runs import (
+    RECORD,
+    Finish,
+    code_fingerprint,
+    compared,
+    is_current,
+    last_words,
+    read_result,
+    run_system,
+)
 from dolens.experiments.running.run_files import is_finished, read_json
 
 PAGE = "index.html"
@@ -138,3 +147,66 @@ def _written(plan: Plan, folder: Path, given: Mapping[str, Path]) -> Report:
 def _status(folder: Path) -> int | None:
     """Return the exit status of a run by the report; None where it has not ended."""
     return read_json(folder / RECORD).get("status")
+
+
+def assemble(
+    plan: Plan, folders: Mapping[str, Path], failed: Mapping[str, str], file: Path
+) -> tuple[Outcome, ...]:
+    """Write the page, and return the outcomes of all checks.
+
+    Args:
+        plan: systems and items.
+        folders: finished runs by the names of their systems.
+        failed: systems whose run ended with an error → what it said last.
+        file: of the page; its folder is made.
+
+    Raises:
+        InputError: a folder is not that of a finished run, or a plan or expected values are wrong.
+    """
+    results = {name: read_result(name, folder) for name, folder in folders.items()}
+    comparisons = compared(plan.comparisons, results)
+    metrics = {name: result.metrics for name, result in results.items()} | comparisons
+    found = outcomes(load_checks(plan), metrics)
+    material = Material(plan, results, comparisons, found, failed, _made(), code_fingerprint())
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(page(material), encoding="utf-8")
+    return found
+
+
+def _made() -> str:
+    now = datetime.datetime.now().astimezone()
+    version = getattr(dolens, "__version__", None)
+    of = f"dolens {version}, code {code_fingerprint()}" if version else f"code {code_fingerprint()}"
+    return f"Made on {now:%-d %B %Y at %H:%M} by {of}."
+
+
+@dataclass
+class Pace:
+    """The speed of this machine beside the one on which the expected times were measured.
+
+    Attributes:
+        expected: seconds of the finished runs, as systems.yaml has them.
+        taken: seconds that they took.
+    """
+
+    expected: float = field(default=0.0)
+    taken: float = field(default=0.0)
+
+    def finished(self, expected: float, taken: float) -> None:
+        """Count a run."""
+        self.expected += expected
+        self.taken += taken
+
+    def estimate(self, seconds: float) -> float:
+        """Return how long work of so many expected seconds takes here."""
+        return seconds * (self.taken / self.expected if self.expected else 1.0)
+
+    def remaining(self, current: float, elapsed: float, later: Iterable[float]) -> float:
+        """Return how long the current run and all later ones still take.
+
+        Args:
+            current: expected seconds of the current run.
+            elapsed: how long it has taken so far.
+            later: expected seconds of the runs after it.
+        """
+        return max(0.0, self.estimate(current) - elapsed) + self.estimate(sum(later))

@@ -15,16 +15,13 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.choices import no_choice
-from dolens.experiments.running.command_line import prepared
-from dolens.experiments.running.failed_parts import reason_of
-from dolens.experiments.running.machine_faults import machine_fault
-from dolens.experiments.running.processes import own_arguments, report_failure
+from dolens.experiments.running.command_line import no_choice, prepared
+from dolens.experiments.running.faults import machine_fault, reason_of, thread_faults_in_one_line
 from dolens.experiments.running.renaming import explained
-from dolens.experiments.running.thread_faults import thread_faults_in_one_line
+from dolens.experiments.running.trainer import own_arguments, report_failure
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
-from dolens.experiments.search.pruned import TrialPruned
+from dolens.experiments.search.pruning import TrialPruned
 from dolens.files import packaged_configuration
 
 logger = logging.getLogger(__name__)

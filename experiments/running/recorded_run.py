@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.plain_values import walk
 from dolens.experiments.running.renaming import translated, with_targets_of_now
 from dolens.experiments.running.run_files import (
     HYDRA,
@@ -23,6 +22,7 @@ from dolens.experiments.running.run_files import (
     job_of,
     overrides_of,
     read_yaml,
+    walk,
 )
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted

@@ -85,7 +85,7 @@ RENAMED = Renamed(
                 "experiments.callbacks.speed_pictures.SpeedPictures",
                 "experiments.callbacks.tolerance_pictures.TolerancePictures",
             ),
-            "dolens.experiments.callbacks.figures.SaveFigures",
+            "dolens.experiments.callbacks.saved_figures.SaveFigures",
         ),
         "dolens.imaging.choice.auto_renderer.AutoRenderer": (
             "dolens.rendering.auto.auto_renderer.AutoRenderer"
@@ -107,7 +107,7 @@ RENAMED = Renamed(
         "experiments.camera.CameraModule": "dolens.experiments.camera.camera.CameraModule",
         "experiments.design.DesignModule": "dolens.experiments.design.design.DesignModule",
         "experiments.lens_least_squares.CameraOptimizer": (
-            "dolens.experiments.camera.lens_least_squares.CameraOptimizer"
+            "dolens.experiments.camera.lens_optimizer.CameraOptimizer"
         ),
         "experiments.misalignment.MisalignmentModule": (
             "dolens.experiments.poses.misalignment.MisalignmentModule"
@@ -132,6 +132,6 @@ RENAMED = Renamed(
         ),
         "experiments.views.depths.DepthViews": "dolens.experiments.camera.views.depths.DepthViews",
         "experiments.views.fields.FieldViews": "dolens.experiments.camera.views.fields.FieldViews",
-        "experiments.views.layers.LayerViews": "dolens.experiments.camera.views.layers.LayerViews",
+        "experiments.views.layers.LayerViews": "dolens.experiments.camera.views.depths.LayerViews",
     },
 )

@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, did_you_mean
-from dolens.experiments.running.override_text import override_text
-from dolens.experiments.running.plain_values import walk
+from dolens.experiments.running.command_line import override_text
 from dolens.experiments.running.renamed_keys import RENAMED, Key, Renamed
+from dolens.experiments.running.run_files import walk
 from dolens.experiments.running.target_keys import Target, arguments_of, located
 
 

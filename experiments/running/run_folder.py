@@ -1,15 +1,20 @@
-"""What run.json and metrics.json of a run say: code, versions, machine, memory, numbers."""
+"""The folder of a run: how it is named, what run.json says, and its log."""
 
+import logging
 import math
 import platform
 import resource
 import subprocess
 import sys
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from dolens.files import installed_version
 
@@ -72,3 +77,77 @@ def _git(root: Path, *arguments: str) -> str:
         ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True
     )
     return done.stdout.strip()
+
+
+# A folder that ends with anything else is the user's choice, who may mean one that is there.
+_MOMENT = "${now:%Y-%m-%d_%H-%M-%S}"
+
+
+class OwnFolder(Callback):
+    """Makes the folder of a run before the run begins.
+
+    Where another one has made it within the same second, this one's name ends with `_2`, and so on.
+    """
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Make the folder of a run.
+
+        Args:
+            config: of the run.
+            kwargs: what else Hydra tells.
+        """
+        _make(config, config.hydra.run)
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Make the folder of a sweep.
+
+        Args:
+            config: of the sweep.
+            kwargs: what else Hydra tells.
+        """
+        _make(config, config.hydra.sweep)
+
+
+def _make(config: DictConfig, place: DictConfig) -> None:
+    written = OmegaConf.to_container(place, resolve=False)["dir"]
+    if not written.endswith(_MOMENT):
+        return
+    before = HydraConfig.instance().cfg
+    HydraConfig.instance().cfg = config
+    try:
+        for number in count(1):
+            with read_write(place):
+                # What else the folder's name refers to stays: jobs may be of several experiments.
+                place.dir = written + (f"_{number}" if number > 1 else "")
+            try:
+                Path(place.dir).mkdir(parents=True)
+            except FileExistsError:
+                continue
+            return
+    except OSError:
+        return  # Hydra makes the folder again, and names what is wrong
+    finally:
+        HydraConfig.instance().cfg = before
+
+
+class LogFile(logging.FileHandler):
+    """Writes the log of a run; a line that cannot be written, as on a full disk, ends nothing.
+
+    The first such line is named on the error output, in one line and not in a traceback for each.
+    """
+
+    _failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Name the failure, once."""
+        if not self._failed:
+            self._failed = True
+            reason = sys.exc_info()[1]
+            sys.stderr.write(f"warning: {self.baseFilename} cannot be written ({reason})\n")
+
+    def close(self) -> None:
+        """Close the file; what it still holds may not find room."""
+        try:
+            super().close()
+        except OSError:
+            self.handleError(logging.makeLogRecord({}))

@@ -16,41 +16,37 @@ from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.callbacks.interruption import InterruptionNotice
-from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
-from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
-from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs, ResumedSchedules
+from dolens.experiments.callbacks.checkpoints import (
+    LogsBeforeCheckpoints,
+    ResumedEpochs,
+    ResumedSchedules,
+)
+from dolens.experiments.callbacks.interruption import InterruptionNotice, LoggedObjectives
 from dolens.experiments.callbacks.starvation import StarvationWarning
-from dolens.experiments.checks import check_sensor_distance
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
-from dolens.experiments.loggers.protocol import RunSummary, summarise
-from dolens.experiments.running.checkpoint_files import WholeCheckpoints
+from dolens.experiments.loggers.protocol import RunSummary, all_settings, choices_of, summarise
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
+    WholeCheckpoints,
     checked_checkpoint,
     settings_of,
 )
 from dolens.experiments.running.command_line import command
-from dolens.experiments.running.compared_settings import all_settings, choices_of
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.running.extensions import import_extensions
-from dolens.experiments.running.made_trainer import made_trainer
-from dolens.experiments.running.matmul_precision import set_matmul_precision
-from dolens.experiments.running.objectives import refuse_unknown, returned
-from dolens.experiments.running.processes import all_processes
-from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.process_settings import set_matmul_precision, set_threads
 from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
 from dolens.experiments.running.run_folder import (
     describe_run,
     peak_memory_mb,
     plain_metrics,
 )
-from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.run_settings import RunSettings, refuse_unknown, returned
 from dolens.experiments.running.target_keys import names_of_targets
-from dolens.experiments.running.threads import set_threads
-from dolens.experiments.search.pruned import TrialPruned
-from dolens.experiments.search.pruning import trial_callbacks
+from dolens.experiments.running.trainer import all_processes, made_trainer
+from dolens.experiments.running.user_configuration import import_extensions
+from dolens.experiments.search.pruning import TrialPruned, trial_callbacks
+from dolens.experiments.settings import check_sensor_distance, register_resolvers
 from dolens.files import written_whole
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens

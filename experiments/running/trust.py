@@ -16,7 +16,7 @@ from lightning.pytorch import callbacks
 import dolens.optimize
 import dolens.reconstruction
 from dolens.errors import InputError
-from dolens.experiments.running.plain_values import walk
+from dolens.experiments.running.run_files import walk
 from dolens.files import packaged_configuration, resolved_path
 
 _TARGET = re.compile(r"_target_: *(?:([\w.]+))")

@@ -12,9 +12,7 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dolens.errors import InputError
-from dolens.experiments.search.directions import BY_MODE, direction_of
-from dolens.experiments.search.pruned import TrialPruned
-from dolens.experiments.search.settings import SearchSettings
+from dolens.experiments.search.settings import BY_MODE, SearchSettings, direction_of
 
 logger = logging.getLogger(__name__)
 
@@ -138,3 +136,10 @@ def trial_callbacks() -> list[PruneTrial]:
     if hydra.mode != RunMode.MULTIRUN or not sweeper.get("storage"):
         return []
     return [PruneTrial(Path(sweeper["storage"]), int(hydra.job.num), SearchSettings.of(sweeper))]
+
+
+class TrialPruned(Exception):
+    """A run is hopeless beside the others of its search; it is stopped, and has not failed.
+
+    The message is one line that gives the number that decided.
+    """

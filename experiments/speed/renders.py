@@ -1,15 +1,19 @@
-"""Whole renders: error against rays without end, time and memory, forward and back."""
+"""Time, memory and error of whole renders and of point spread functions."""
 
+import gc
+import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
 
-from dolens.experiments.speed.timing import by_turns, peak_megabytes
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.probes import Reference, probe_image, reference
+from dolens.rendering.auto.field_grid import spread_pixels, survey
+from dolens.rendering.auto.probes import Reference, grey_levels, probe_image, reference
 from dolens.rendering.gradient_check import (
     Agreement,
     Render,
@@ -19,6 +23,7 @@ from dolens.rendering.gradient_check import (
     image_measure,
     reference_strata,
 )
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -234,3 +239,77 @@ def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> di
         own = gradient(render, texture, measure, (1,))
         found[contender.setting] = agreement(own, judge)
     return found
+
+
+_POINTS, _TRUE_SAMPLES, _SIZE = 9, 160, 65
+
+
+@torch.no_grad()
+def function_rows(
+    subject: Subject, samples: Sequence[int], seconds: float
+) -> list[dict[str, float | str]]:
+    """Return a row for each number of rays: error in grey levels on the probe, time a function.
+
+    Args:
+        subject: the scene.
+        samples: strata along each side of the pupil.
+        seconds: that timing may take.
+    """
+    imaging = ImagingSystem.of(subject.lens.system(), subject.scene, subject.sensor)
+    places = spread_pixels(subject.sensor, _POINTS)
+
+    def functions(count: int, seed: int) -> torch.Tensor:
+        found = survey(imaging, places, count, seed)
+        return found.functions(_SIZE, found.chief is not None)
+
+    truth = functions(_TRUE_SAMPLES, 0)
+    times = by_turns({str(n): lambda n=n: functions(n, 1) for n in samples}, seconds)
+    each = _POINTS * truth.shape[1] * truth.shape[2]
+    return [
+        {
+            "scene": subject.name,
+            "part": "psf",
+            "model": "psf",
+            "setting": f"{n * n} rays",
+            "error_grey_levels": float(grey_levels(functions(n, 1) - truth).square().mean().sqrt()),
+            "forward_s": times[str(n)] / each,
+        }
+        for n in samples
+    ]
+
+
+def by_turns(
+    calls: Mapping[str, Callable[[], object]], seconds: float, rounds: int = 3
+) -> dict[str, float]:
+    """Return the median time of each call, s.
+
+    Calls run by turns, so that a phase in which the machine is slow meets all of them, each at
+    least `rounds` times and on until `seconds` are spent.  A first turn is not counted.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+    began, turn = time.perf_counter(), 0
+    while turn < rounds or time.perf_counter() - began < seconds:
+        for name, call in calls.items():
+            started = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - started)
+        turn += 1
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def peak_megabytes(call: Callable[[], object]) -> float:
+    """Return the peak memory of the CPU tensors of a call, MB.
+
+    Added up from the allocator's own events; what a kernel keeps to itself is not among them.
+    """
+    gc.collect()
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
+        call()
+    held = most = 0
+    for event in run.profiler.kineto_results.events():
+        if event.name() == "[memory]" and event.device_type() == torch.autograd.DeviceType.CPU:
+            held += event.nbytes()
+            most = max(most, held)
+    return most / 1e6

@@ -1,27 +1,118 @@
-"""Measurement of speed and error of traces, point spread functions and renders."""
+"""Speed and error of traces, point spread functions and renders are measured and drawn."""
 
 import logging
+import math
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from dolens.errors import check_choice
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.experiment import Figures
-from dolens.experiments.speed.figures import speed_figures
-from dolens.experiments.speed.functions import function_rows
+import torch
+from matplotlib.figure import Figure
+
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.experiments.experiment import Analysis, Figures
+from dolens.experiments.settings import check_count, check_finite, check_sensor_distance, numbers_of
 from dolens.experiments.speed.renders import (
     Subject,
+    function_rows,
     gradient_agreements,
     render_contenders,
     render_rows,
 )
-from dolens.experiments.speed.settings import Contenders, Effort, subject_of
 from dolens.experiments.speed.traces import trace_rows
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from dolens.plotting import Point, pareto_front
+from dolens.optics.parameter_names import to_lens_units
+from dolens.plotting import Point, pareto_figure, pareto_front
 from dolens.plotting.layout import lens_title
+from dolens.prescriptions import lens_from_prescription
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
 from dolens.tasks import stage as named_stage
+from dolens.typed_values import call_with_settings, check_type
+
+_SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
+
+
+@dataclass(frozen=True)
+class Contenders:
+    """The ways of rendering that are compared.
+
+    Attributes:
+        pupil_samples: strata along each side of the pupil, of rays and of functions.
+        fields: functions along each side of the sensor.
+        tolerances: grey levels that `auto` plans for.
+
+    Raises:
+        InputError: a number of strata or functions that is no integer of 1 or more.
+    """
+
+    pupil_samples: Sequence[int]
+    fields: Sequence[int]
+    tolerances: Sequence[float]
+
+    def __post_init__(self) -> None:
+        for key in ("pupil_samples", "fields"):
+            for number in getattr(self, key):
+                check_count(key, number)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The work that goes into references and times.
+
+    Attributes:
+        reference_samples: strata of the converged image.
+        rays: of a trace.
+        seconds: for the times of each group.
+
+    Raises:
+        InputError: a number of strata or rays that is no integer of 1 or more.
+    """
+
+    reference_samples: int
+    rays: int
+    seconds: float
+
+    def __post_init__(self) -> None:
+        check_count("reference_samples", self.reference_samples)
+        check_count("rays", self.rays)
+
+
+def subject_of(name: str, settings: Mapping[str, Any]) -> Subject:
+    """Return a lens and its scene as a configuration gives them.
+
+    Args:
+        name: of the scene.
+        settings: `lens` (a prescription), `values` (parameters to change), `depths` (mm),
+            `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken of.
+
+    Raises:
+        InputError: an unknown key, or a bad value.
+    """
+    check_keys(settings, _SCENE_KEYS, f"scenes.{name}")
+    for key in _SCENE_KEYS:
+        if key != "values" and key not in settings:
+            raise InputError(f"scenes.{name}.{key}: is missing")
+    lens = lens_from_prescription(settings["lens"], torch.float32, where=f"scenes.{name}.lens")
+    check_sensor_distance(lens, f"scenes.{name}.lens")
+    with torch.no_grad():
+        for pattern, value in (settings.get("values") or {}).items():
+            check_finite(f"scenes.{name}.values.{pattern}", value)
+            for key, parameter in lens.variables([pattern]).items():
+                parameter.fill_(to_lens_units(key, value))
+    numbers = {k: numbers_of(f"scenes.{name}.{k}", settings[k]) for k in ("depths", "wavelengths")}
+    scene = PlanarScene(**numbers)
+    sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
+    check_type(settings["variables"], Sequence[str], f"scenes.{name}.variables")
+    try:
+        names = tuple(lens.variables(list(settings["variables"])))
+    except InputError as error:
+        raise InputError(f"scenes.{name}.variables: {error}") from error
+    return Subject(name, lens.requires_grad_(False), scene, sensor, names)
+
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +205,7 @@ class SpeedVsErrorModule(Analysis):
             row["gradient_error"] = found.error if found else float("nan")
             row["gradient_noise"] = found.noise if found else float("nan")
         by_setting = {row["setting"]: row for row in rows}
-        front = {p.label for p in pareto_front(_points(rows))}
+        front = {p.label for p in pareto_front(_gradient_points(rows))}
         for row in rows:
             row["on_front"] = float(row["setting"] in front)
         numbers[f"error/reference_noise/{name}"] = judge.noise
@@ -135,5 +226,93 @@ class SpeedVsErrorModule(Analysis):
         return rows
 
 
-def _points(rows: Sequence[Mapping[str, Any]]) -> list[Point]:
+def _gradient_points(rows: Sequence[Mapping[str, Any]]) -> list[Point]:
     return [Point(str(r["setting"]), r["with_gradient_s"], r["error_grey_levels"]) for r in rows]
+
+
+# Part → cost's and error's columns, and their labels.
+_AXES = {
+    "trace": (
+        "with_gradient_ns",
+        "error_um",
+        "time per ray and surface, forward and backward (ns)",
+        "largest error on the sensor (µm)",
+    ),
+    "psf": (
+        "forward_s",
+        "error_grey_levels",
+        "time per point spread function (µs)",
+        "RMS error of an image (grey levels)",
+    ),
+    "render": (
+        "with_gradient_s",
+        "error_grey_levels",
+        "time per image, forward and backward (s)",
+        "RMS error of an image (grey levels)",
+    ),
+}
+_GRADIENT_AXES = (
+    "with_gradient_s",
+    "gradient_error",
+    "time per image, forward and backward (s)",
+    "relative error of the gradient (no unit)",
+)
+_TITLES = {"trace": "ray traces", "psf": "point spread functions", "render": "images"}
+# Seconds in the table, µs in the figure.
+_SCALE = {"forward_s": 1e6}
+_LEAST_ERROR = {"trace": 1e-10, "psf": None, "render": None}
+
+
+def speed_figures(rows: Sequence[Row], scenes: Mapping[str, str], parts: Sequence[str]) -> Figures:
+    """Return error against cost: `<part>_<scene>`, and `gradient_<scene>` for renders.
+
+    Args:
+        rows: the table of measurements.
+        scenes: name → its lens and aperture, for titles.
+        parts: those that were measured, of `trace`, `psf` and `render`.
+    """
+    figures = {}
+    for scene, lens in scenes.items():
+        for part in parts:
+            figures[f"{part}_{scene}"] = partial(_part_figure, rows, scene, part, lens)
+        if "render" in parts:
+            figures[f"gradient_{scene}"] = partial(_gradient_figure, rows, scene, lens)
+    return figures
+
+
+def _part_figure(rows: Sequence[Row], scene: str, part: str, lens: str) -> Figure:
+    cost, error, *labels = _AXES[part]
+    floor = _uncertainty(rows, scene) if part == "render" else _LEAST_ERROR[part]
+    points = _points(rows, scene, part, cost, error)
+    return pareto_figure(points, *labels, f"{lens}\n{_TITLES[part]}: error against time", floor)
+
+
+def _gradient_figure(rows: Sequence[Row], scene: str, lens: str) -> Figure:
+    cost, error, *labels = _GRADIENT_AXES
+    points = _points(rows, scene, "render", cost, error)
+    return pareto_figure(points, *labels, f"{lens}\ngradients of images: error against time", None)
+
+
+def _points(
+    rows: Sequence[Row], scene: str, part: str, cost: str, error: str
+) -> dict[str, list[Point]]:
+    """Return the points of a scene and part by model; settings without a finite error have none."""
+    families: dict[str, list[Point]] = {}
+    for row in rows:
+        if (row["scene"], row["part"]) == (scene, part) and math.isfinite(float(row[error])):
+            model = str(row["model"])
+            setting = _setting(str(row["setting"]))
+            point = Point(setting, _SCALE.get(cost, 1.0) * row[cost], row[error], model == "auto")
+            families.setdefault(model, []).append(point)
+    return families
+
+
+def _uncertainty(rows: Sequence[Row], scene: str) -> float | None:
+    """Return the grey levels below which errors of a scene's renders are not known."""
+    mine = [row for row in rows if (row["scene"], row["part"]) == (scene, "render")]
+    return mine[0]["error_uncertainty"] if mine else None
+
+
+def _setting(setting: str) -> str:
+    """Return a label: one ray, not `1 rays`; one grey level likewise."""
+    return re.sub(r"\b1 (ray|grey level)s$", r"1 \1", setting)

@@ -6,8 +6,7 @@ from unittest import mock
 
 import torch
 
-from dolens.experiments.speed.renders import Subject
-from dolens.experiments.speed.timing import by_turns
+from dolens.experiments.speed.renders import Subject, by_turns
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces import base, newton

@@ -10,14 +10,14 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
+from hydra.experimental.callback import Callback
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.command_line import command
 from dolens.experiments.running.run_files import is_finished
-from dolens.experiments.sweeps.job import SweepJob
-from dolens.experiments.sweeps.job_folder import refuse_other_settings
+from dolens.experiments.sweeps.job import SweepJob, refuse_other_settings
 
 logger = logging.getLogger(__name__)
 
@@ -134,3 +134,26 @@ def one_after_another(jobs: Sequence[SweepJob]) -> Iterator[tuple[SweepJob, JobR
     for job in jobs:
         logger.info("Job %d: %s", job.number, job.text())
         yield job, job.run()
+
+
+_BASIC = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+_OWN = "hydra_plugins.dolens_launchers.SerialLauncher"
+
+
+class OwnBasicLauncher(Callback):
+    """Puts dolens's launcher in the place of Hydra's basic one, before a sweep begins.
+
+    A file of the configuration cannot do so: Hydra keeps the name `basic` for its own, and another
+    default would win over the launcher that a file of `search` chooses.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Replace the launcher.
+
+        Args:
+            config: of the sweep.
+            kwargs: what else Hydra tells.
+        """
+        if config.hydra.launcher.get("_target_") == _BASIC:
+            with read_write(config.hydra.launcher):
+                config.hydra.launcher._target_ = _OWN

@@ -13,17 +13,15 @@ from torch import Tensor
 from dolens.analysis.conditions import field_shares
 from dolens.analysis.fields_and_wavelengths import spectral_shares
 from dolens.errors import InputError
-from dolens.experiments.analysis import Analysis
-from dolens.experiments.checks import check_count, numbers_of
-from dolens.experiments.experiment import Figures
-from dolens.experiments.settings import Spots
+from dolens.experiments.experiment import Analysis, Figures
+from dolens.experiments.settings import Spots, check_count, numbers_of
 from dolens.experiments.tables import Row
-from dolens.experiments.tolerances.figures import tolerance_figures
-from dolens.experiments.tolerances.tables import (
+from dolens.experiments.tolerances.tolerance_report import (
     monte_carlo_rows,
     offender_rows,
     offender_text,
     sensitivity_rows,
+    tolerance_figures,
 )
 from dolens.experiments.workers import workers_of
 from dolens.optics.fabrication_errors import names_fabrication_errors

@@ -74,7 +74,7 @@ class JoblibLauncher(SweepLauncher):
 
     def runner(self) -> Any:
         """Return what runs the jobs."""
-        from dolens.experiments.sweeps.processes import in_processes
+        from dolens.experiments.sweeps.launchers import in_processes
 
         return in_processes
 
@@ -84,7 +84,7 @@ class LocalSubmititLauncher(SweepLauncher):
 
     def runner(self) -> Any:
         """Return what runs the jobs."""
-        from dolens.experiments.sweeps.submission import in_local_submissions
+        from dolens.experiments.sweeps.launchers import in_local_submissions
 
         return in_local_submissions
 
@@ -94,7 +94,7 @@ class SlurmLauncher(SweepLauncher):
 
     def runner(self) -> Any:
         """Return what runs the jobs."""
-        from dolens.experiments.sweeps.submission import in_slurm_jobs
+        from dolens.experiments.sweeps.launchers import in_slurm_jobs
 
         return in_slurm_jobs
 
@@ -104,6 +104,6 @@ class RayLauncher(SweepLauncher):
 
     def runner(self) -> Any:
         """Return what runs the jobs."""
-        from dolens.experiments.sweeps.ray_tasks import in_ray_tasks
+        from dolens.experiments.sweeps.launchers import in_ray_tasks
 
         return in_ray_tasks

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from dolens.experiments.camera.camera import CameraModule
-from dolens.experiments.camera.made_images import restored_in_parts, training_images
+from dolens.experiments.camera.made_lenses import restored_in_parts, training_images
 from dolens.optimize.operands import UnreachableField
 from dolens.optimize.trust_region_step import ray_moves
 from dolens.rendering import psf_grid

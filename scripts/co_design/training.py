@@ -11,8 +11,8 @@ from hydra.utils import instantiate
 
 from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.process_settings import set_threads
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import build_lens
 from scripts.composed import composed
 

@@ -8,8 +8,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.experiments.data.photos import PhotosDataModule
-from dolens.experiments.pretraining.examples import blurred
+from dolens.experiments.data.package_photographs import PhotosDataModule
+from dolens.experiments.pretraining.pretraining import blurred
 from dolens.plotting.style import PAGE, SMALL, draw_title
 from dolens.reconstruction import GeneralRestoration, Restoration, WienerTVRestoration, psnr_db
 from dolens.reconstruction.likelihood import estimated_motion

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from dolens import load_lens
-from dolens.experiments.running.checkpoint_files import read_checkpoint
+from dolens.experiments.running.checkpoints import read_checkpoint
 from dolens.files import UNFINISHED
 
 # Times differ from run to run, and so does what one process of several has done.

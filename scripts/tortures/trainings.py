@@ -81,12 +81,12 @@ def failing_figure(folder: Path) -> list[str]:
 
     def prepare() -> None:
         trust()
-        from dolens.experiments.callbacks import figures
+        from dolens.experiments.callbacks import saved_figures
 
         def fail(*_: object, **__: object) -> None:
             raise RuntimeError("no ink")
 
-        figures.save_figures = fail
+        saved_figures.save_figures = fail
 
     run = folder / "run"
     process = start([*FIGURES, f"hydra.run.dir={run}"], log(run), prepare)

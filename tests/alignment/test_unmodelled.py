@@ -13,7 +13,7 @@ from dolens.alignment.measurement import simulated
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled, diffracted_light, unmodelled_of
 from dolens.errors import InputError
-from dolens.experiments.poses.estimates import Held, estimates, probability
+from dolens.experiments.poses.fitting import Held, estimates, probability
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.spot_image import SpotImager

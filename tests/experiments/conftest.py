@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
-from dolens.experiments.workers import own_process
+from dolens.experiments.workers import workers
 from dolens.tasks import in_turn
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
@@ -114,7 +114,7 @@ def pickled_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
         pieces = [pickle.dumps((function, task)) for task in tasks]
         return map(pickle.loads, in_turn(elsewhere, pieces, name))
 
-    monkeypatch.setattr(own_process, "in_turn", pickled)
+    monkeypatch.setattr(workers, "in_turn", pickled)
 
 
 @pytest.fixture

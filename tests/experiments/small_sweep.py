@@ -11,7 +11,7 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import OmegaConf
 
 from dolens.experiments.running.user_configuration import use_working_folder
-from dolens.experiments.sweeps.basic_launcher import OwnBasicLauncher
+from dolens.experiments.sweeps.launch import OwnBasicLauncher
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = {"value": 0, "act": "finish", "objective": "score", "threads": None, "ckpt_path": None}

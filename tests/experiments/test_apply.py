@@ -14,10 +14,9 @@ from dolens.errors import InputError
 from dolens.experiments.camera.reconstruction import ImageNetwork
 from dolens.experiments.camera.restored_windows import margin_of, restore_in_windows, windows
 from dolens.experiments.camera.views.whole import Placing, at_depth, axial_function, convolved
-from dolens.experiments.commands.apply import PictureCamera, apply_run
+from dolens.experiments.commands.apply import PictureCamera, apply_run, signal_of
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.picture_files import read_array, read_picture, write_picture
-from dolens.experiments.commands.raw_signal import signal_of
+from dolens.experiments.commands.pictures import read_array, read_picture, write_picture
 from dolens.experiments.running.finished_run import load_run
 from dolens.reconstruction import GeneralRestoration, UNetRestoration, WienerUNetRestoration
 from dolens.rendering.ray_renderer import RayRenderer

@@ -13,7 +13,7 @@ from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.experiments.commands.apply_lens import LensCamera, read_out
 from dolens.experiments.commands.apply_options import LensOptions, depth_of, size_of
-from dolens.experiments.commands.picture_files import read_picture, write_picture
+from dolens.experiments.commands.pictures import read_picture, write_picture
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
 from dolens.sensor.readout import Readout

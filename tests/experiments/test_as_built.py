@@ -12,8 +12,11 @@ from tiny_experiment import TINY, TINY_NETWORK
 
 from dolens import InputError
 from dolens.experiments.camera.as_built import AsBuilt, Manufacture
-from dolens.experiments.camera.made_images import images_of_made_lenses
-from dolens.experiments.camera.made_lens_scores import MadeLensScores, spread_over_photographs
+from dolens.experiments.camera.made_lenses import (
+    MadeLensScores,
+    images_of_made_lenses,
+    spread_over_photographs,
+)
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
 from dolens.rendering.psf import axial_point_spread_functions

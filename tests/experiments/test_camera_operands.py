@@ -7,7 +7,7 @@ import torch
 import yaml
 from hydra.utils import instantiate
 
-from dolens.experiments.camera.operands import CameraOperands
+from dolens.experiments.camera.lens_merit import CameraOperands
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
 from dolens.optics.aiming import aim

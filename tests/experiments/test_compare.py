@@ -14,11 +14,9 @@ from dolens.cli.app import app
 from dolens.cli.compare import fitting
 from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import TABLE, scores_by_photograph
-from dolens.experiments.comparison.best import best_lines
-from dolens.experiments.comparison.comparison import compared, csv_of, markdown_of, plain
-from dolens.experiments.comparison.gains import gain
-from dolens.experiments.comparison.labels import metric_label, setting_label
-from dolens.experiments.comparison.sweep import SweepComparison
+from dolens.experiments.comparison.comparison import compared, csv_of, gain, markdown_of, plain
+from dolens.experiments.comparison.rows import metric_label, setting_label
+from dolens.experiments.comparison.sweep import SweepComparison, best_lines
 from dolens.experiments.tables import write_table
 
 

@@ -15,7 +15,7 @@ from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.evaluate import evaluate
 from dolens.experiments.commands.export import ExportSettings, export_run
 from dolens.experiments.comparison.comparison import compared
-from dolens.experiments.report.results import read_result
+from dolens.experiments.report.runs import read_result
 from dolens.experiments.running.checkpoints import SETTINGS, checked_checkpoint
 from dolens.experiments.running.finished_run import load_run
 from dolens.experiments.running.run_files import (

@@ -8,8 +8,8 @@ from hydra.utils import instantiate
 from overlaps import flaws
 
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.experiments.design.merit_pupil import rays_text, reference_text
-from dolens.experiments.design.tables import spot_table
+from dolens.experiments.design.merit_rays import rays_text, reference_text
+from dolens.experiments.design.spot_tables import spot_table
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from dolens.optics.paraxial import first_order

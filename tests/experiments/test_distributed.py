@@ -15,12 +15,11 @@ from omegaconf import OmegaConf
 
 from dolens.errors import InputError
 from dolens.experiments.camera.views.fields import FieldViews
-from dolens.experiments.data.photos import PhotosDataModule
-from dolens.experiments.data.resumable import ResumableSampler
+from dolens.experiments.data.crop_loading import ResumableSampler
+from dolens.experiments.data.package_photographs import PhotosDataModule
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.running.made_trainer import made_trainer
-from dolens.experiments.running.processes import _Started
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.trainer import _Started, made_trainer
 from dolens.experiments.running.training import build_lens, run
 from dolens.rendering.auto.choice import Choice
 from dolens.rendering.psf_renderer import PsfRenderer

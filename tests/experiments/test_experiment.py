@@ -7,7 +7,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Analysis
 from dolens.experiments.running.training import run
 from tests.experiments.run_tables import table
 

@@ -8,10 +8,10 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from dolens.errors import InputError
-from dolens.experiments.camera.exportable import exportable
+from dolens.experiments.camera.network_export import exportable
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.picture_files import write_picture
+from dolens.experiments.commands.pictures import write_picture
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
 from dolens.sensor.colour import linear_to_srgb

@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from dolens import InputError
-from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.finished_run import load_run
 from dolens.experiments.running.training import run
+from dolens.experiments.running.user_configuration import import_extensions
 from dolens.optics.surfaces import SURFACES, unregister_surface
 from tests.experiments.conftest import finished_run
 

@@ -8,13 +8,13 @@ import torch
 from hydra.utils import instantiate
 
 from dolens.experiments.camera.as_built import AsBuilt, Manufacture
-from dolens.experiments.camera.made_images import images_of_made_lenses
-from dolens.experiments.camera.untrained_rivals import restored_by_rivals
-from dolens.experiments.camera.views.field_functions import field_functions
+from dolens.experiments.camera.evaluation import restored_by_rivals
+from dolens.experiments.camera.made_lenses import images_of_made_lenses
+from dolens.experiments.camera.views.field_windows import field_functions
 from dolens.experiments.camera.views.fields import FieldViews
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.picture_files import write_picture
+from dolens.experiments.commands.pictures import write_picture
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from dolens.reconstruction import WienerTVRestoration, psnr_db

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dolens.errors import InputError
-from dolens.experiments.callbacks.figures import SaveFigures
+from dolens.experiments.callbacks.saved_figures import SaveFigures
 from dolens.experiments.experiment import Experiment
-from dolens.experiments.loggers.tensorboard import TensorBoard
+from dolens.experiments.loggers.trackers import TensorBoard
 
 
 class Drawn(Experiment):

@@ -8,9 +8,8 @@ from torch.optim import lr_scheduler as schedules
 from torch.utils.data import DataLoader, TensorDataset
 
 from dolens.errors import InputError
-from dolens.experiments.callbacks.finite_training import FiniteTraining
-from dolens.experiments.callbacks.last_checkpoint import LastCheckpoint
-from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs, ResumedSchedules
+from dolens.experiments.callbacks.checkpoints import LastCheckpoint, ResumedEpochs, ResumedSchedules
+from dolens.experiments.callbacks.interruption import FiniteTraining
 
 NAN = float("nan")
 

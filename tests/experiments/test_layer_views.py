@@ -8,7 +8,7 @@ import torch
 from hydra.errors import InstantiationException
 
 from dolens.errors import InputError
-from dolens.experiments.data.occluders import with_occluders
+from dolens.experiments.camera.views.depths import with_occluders
 from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 

@@ -10,7 +10,7 @@ import yaml
 
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
-from dolens.experiments.camera.lens_least_squares import CameraOptimizer, LensLeastSquares
+from dolens.experiments.camera.lens_optimizer import CameraOptimizer, LensLeastSquares
 from dolens.experiments.running.training import run
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription, load_lens

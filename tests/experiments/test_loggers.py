@@ -12,11 +12,11 @@ from hydra.utils import instantiate
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dolens.errors import InputError
-from dolens.experiments.callbacks.validation_pictures import ValidationPictures, side_by_side
+from dolens.experiments.callbacks.photograph_results import ValidationPictures, side_by_side
 from dolens.experiments.loggers import history as history_file
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, TakesPictures, TakesSummary, summarise
-from dolens.experiments.loggers.tensorboard import TensorBoard
+from dolens.experiments.loggers.trackers import TensorBoard
 from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 

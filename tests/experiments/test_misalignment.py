@@ -11,7 +11,7 @@ from tiny_experiment import figure_names
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
-from dolens.experiments.poses.settings import blur_for, spot_imager, values_imager
+from dolens.experiments.poses.fit_plan import blur_for, spot_imager, values_imager
 from dolens.experiments.running.training import run
 from dolens.sensor.pixels import Sensor
 

@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.experiments.camera import network_export
-from dolens.experiments.camera.exportable import exportable
-from dolens.experiments.camera.network_export import export_onnx, export_torch
+from dolens.experiments.camera.network_export import export_onnx, export_torch, exportable
 from dolens.experiments.camera.reconstruction import restoration_of
 from dolens.reconstruction import (
     FeaturePyramidRestoration,

@@ -15,16 +15,15 @@ from typer.testing import CliRunner
 
 from dolens.cli.app import app
 from dolens.errors import InputError
-from dolens.experiments.callbacks import figures
+from dolens.experiments.callbacks import saved_figures
 from dolens.experiments.loggers import history as history_file
 from dolens.experiments.loggers.history import History
-from dolens.experiments.loggers.tensorboard import TensorBoard
-from dolens.experiments.running import checkpoint_files
-from dolens.experiments.running.checkpoint_files import WholeCheckpoints, read_checkpoint
-from dolens.experiments.running.log_file import LogFile
-from dolens.experiments.running.machine_faults import machine_fault
+from dolens.experiments.loggers.trackers import TensorBoard
+from dolens.experiments.running import checkpoints
+from dolens.experiments.running.checkpoints import WholeCheckpoints, read_checkpoint
+from dolens.experiments.running.faults import machine_fault, thread_faults_in_one_line
 from dolens.experiments.running.run_files import write_json
-from dolens.experiments.running.thread_faults import thread_faults_in_one_line
+from dolens.experiments.running.run_folder import LogFile
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 CHECKPOINT = {"state_dict": {"weight": torch.arange(4096.0)}, "global_step": 7}
@@ -54,7 +53,7 @@ def test_a_checkpoint_that_finds_no_room_leaves_the_one_before_it(saved, monkeyp
         file.write(b"half")
         raise FULL
 
-    monkeypatch.setattr(checkpoint_files.torch, "save", half)
+    monkeypatch.setattr(checkpoints.torch, "save", half)
     with pytest.raises(OSError, match="No space"):
         WholeCheckpoints().save_checkpoint({"state_dict": {}}, saved)
     assert read_checkpoint(saved)["global_step"] == 7
@@ -64,7 +63,7 @@ def test_a_checkpoint_that_finds_no_room_leaves_the_one_before_it(saved, monkeyp
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_a_full_disk_is_named_whatever_pytorch_says_of_it():
     with pytest.raises(OSError) as caught:
-        checkpoint_files._save(CHECKPOINT, Path("/dev/full"))
+        checkpoints._save(CHECKPOINT, Path("/dev/full"))
     assert machine_fault(caught.value) == "/dev/full: the disk is full"
 
 
@@ -191,9 +190,9 @@ def test_json_is_whole_or_as_it_was(tmp_path, monkeypatch):
 
 
 def test_a_figure_that_fails_is_logged(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(figures, "save_figures", lambda *_: (_ for _ in ()).throw(FULL))
-    figures._keep(
-        lambda: {"layout": lambda: None}, lambda name, figure: figures.save_figures(figure)
+    monkeypatch.setattr(saved_figures, "save_figures", lambda *_: (_ for _ in ()).throw(FULL))
+    saved_figures._keep(
+        lambda: {"layout": lambda: None}, lambda name, figure: saved_figures.save_figures(figure)
     )
     assert "No figure 'layout'" in caplog.text
 

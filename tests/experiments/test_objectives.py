@@ -8,11 +8,10 @@ import pytest
 from hydra.utils import instantiate
 
 from dolens.errors import InputError
-from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
+from dolens.experiments.callbacks.interruption import LoggedObjectives
 from dolens.experiments.design.design import DesignModule
 from dolens.experiments.experiment import Experiment
-from dolens.experiments.running.objectives import is_among, refuse_unknown, returned
-from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.run_settings import RunSettings, is_among, refuse_unknown, returned
 from dolens.experiments.running.target_keys import names_of_targets
 from dolens.experiments.running.training import build_lens
 from tests.experiments.conftest import TINY_CAMERA

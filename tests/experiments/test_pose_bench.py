@@ -7,9 +7,8 @@ import torch
 import yaml
 
 from dolens.errors import InputError
-from dolens.experiments.poses.bench import Bench, Light, draw, light_of, simulate
-from dolens.experiments.poses.observations import Observations
-from dolens.experiments.poses.settings import fit_plan
+from dolens.experiments.poses.bench import Bench, Light, Observations, draw, light_of, simulate
+from dolens.experiments.poses.fit_plan import fit_plan
 from dolens.prescriptions import lens_from_prescription
 from dolens.sensor.pixels import Sensor
 

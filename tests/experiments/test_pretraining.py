@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 from tiny_experiment import TINY
 
-from dolens.experiments.pretraining.examples import Draws, Examples
-from dolens.experiments.pretraining.textures import dead_leaves, text
+from dolens.experiments.pretraining.pretraining import Draws, Examples, dead_leaves, text
 from dolens.experiments.running.training import run
 from dolens.reconstruction.general import Stabiliser
 from dolens.sensor.colour import srgb_to_linear

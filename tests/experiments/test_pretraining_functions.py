@@ -11,11 +11,13 @@ from dolens.diffraction.pixel_psf import quadratic_b_spline
 from dolens.diffraction.pupil_fit import regular_pupil
 from dolens.errors import InputError
 from dolens.experiments.pretraining import pixel_functions as module
-from dolens.experiments.pretraining.functions import cameras, function_bank
 from dolens.experiments.pretraining.pixel_functions import pixel_functions
-from dolens.experiments.pretraining.random_pupils import GREEN, Draw, FormulaOptics
-from dolens.experiments.pretraining.traced_pupils import (
+from dolens.experiments.pretraining.random_cameras import cameras, function_bank
+from dolens.experiments.pretraining.random_pupils import (
+    GREEN,
     HELD_OUT,
+    Draw,
+    FormulaOptics,
     Prescriptions,
     fitted_pupils,
     within_tolerances,

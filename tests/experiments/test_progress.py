@@ -11,21 +11,19 @@ import torch
 from rich.console import Console
 
 from dolens.errors import InputError
-from dolens.experiments.callbacks.progress import callback as callback_file
-from dolens.experiments.callbacks.progress.callback import RunProgress
-from dolens.experiments.callbacks.progress.displays import (
+from dolens.experiments.callbacks import run_progress as callback_file
+from dolens.experiments.callbacks.progress_display import (
     LogDisplay,
+    MovingAverage,
+    Snapshot,
     TerminalDisplay,
+    clock_text,
     display_for,
     logging_above,
     plain_text,
-)
-from dolens.experiments.callbacks.progress.state import (
-    MovingAverage,
-    Snapshot,
-    clock_text,
     speed_text,
 )
+from dolens.experiments.callbacks.run_progress import RunProgress
 from dolens.tasks import stage
 
 SOME = Snapshot(

@@ -6,8 +6,8 @@ import logging
 import pytest
 import torch
 
+from dolens.experiments.camera.evaluation import behind_line, gain_line, gain_numbers
 from dolens.experiments.camera.photograph_scores import PhotographScores
-from dolens.experiments.camera.restoration_gain import behind_line, gain_line, gain_numbers
 from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 

@@ -14,11 +14,9 @@ from optuna.distributions import (
 
 from dolens.errors import InputError
 from dolens.experiments.running.run_files import info_of, write_json
-from dolens.experiments.search.directions import direction_of, directions_of
-from dolens.experiments.search.report import best_trials, markdown_of, write_report
-from dolens.experiments.search.search import INTERRUPTED, Result, Search, outcome
-from dolens.experiments.search.settings import SearchSettings
-from dolens.experiments.search.space import search_space
+from dolens.experiments.search.search import INTERRUPTED, Result, Search, outcome, search_space
+from dolens.experiments.search.settings import SearchSettings, direction_of, directions_of
+from dolens.experiments.search.sweep import best_trials, markdown_of, write_report
 
 TPE = {"_target_": "optuna.samplers.TPESampler", "n_startup_trials": 4}
 

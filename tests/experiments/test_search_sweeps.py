@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
-from dolens.experiments.search.pruned import TrialPruned
-from dolens.experiments.search.pruning import PruneTrial
+from dolens.experiments.search.pruning import PruneTrial, TrialPruned
 from dolens.experiments.search.storage import record_of_job
 from tests.experiments.test_search import begun
 

@@ -11,7 +11,7 @@ from tiny_experiment import figure_names
 
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
-from dolens.experiments.speed.timing import by_turns, peak_megabytes
+from dolens.experiments.speed.renders import by_turns, peak_megabytes
 from dolens.plotting import Point, pareto_front
 
 SMALL = [

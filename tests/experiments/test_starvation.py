@@ -7,8 +7,8 @@ import torch
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.starvation import StarvationWarning
-from dolens.experiments.running import threads
-from dolens.experiments.running.threads import set_threads
+from dolens.experiments.running import process_settings
+from dolens.experiments.running.process_settings import set_threads
 from dolens.threads import ThreadTimes
 
 
@@ -74,7 +74,7 @@ def of_64(monkeypatch):
     chosen = []
     monkeypatch.setattr(torch, "get_num_threads", lambda: 64)
     monkeypatch.setattr(torch, "set_num_threads", chosen.append)
-    monkeypatch.setattr(threads, "allowed_processors", lambda: 2)
+    monkeypatch.setattr(process_settings, "allowed_processors", lambda: 2)
     return chosen
 
 
@@ -91,7 +91,7 @@ def test_the_users_number_of_threads_comes_first(of_64, monkeypatch):
     set_threads(None)
     assert of_64 == [48]
     monkeypatch.delenv("OMP_NUM_THREADS")
-    monkeypatch.setattr(threads, "allowed_processors", lambda: os.cpu_count() + 64)
+    monkeypatch.setattr(process_settings, "allowed_processors", lambda: os.cpu_count() + 64)
     set_threads(None)
     assert of_64 == [48]
 

@@ -17,15 +17,11 @@ from hydra.core.utils import setup_globals
 from omegaconf import OmegaConf
 
 from dolens.errors import InputError
-from dolens.experiments.comparison.found import run_folders
-from dolens.experiments.comparison.run import read_unfinished
-from dolens.experiments.running.own_folder import OwnFolder
+from dolens.experiments.comparison.runs import read_unfinished, run_folders
 from dolens.experiments.running.run_files import is_finished
-from dolens.experiments.sweeps import shares
-from dolens.experiments.sweeps.processes import in_processes
-from dolens.experiments.sweeps.ray_tasks import in_ray_tasks
-from dolens.experiments.sweeps.shares import share_of
-from dolens.experiments.sweeps.submission import in_slurm_jobs
+from dolens.experiments.running.run_folder import OwnFolder
+from dolens.experiments.sweeps import launchers
+from dolens.experiments.sweeps.launchers import in_processes, in_ray_tasks, in_slurm_jobs, share_of
 from tests.experiments.small_sweep import ROOT, sweep
 
 
@@ -168,7 +164,7 @@ def test_jobs_at_once_times_threads_are_the_cores(monkeypatch, jobs, n_jobs, thr
 
 def test_too_many_threads_are_told_and_no_jobs_refused(monkeypatch, caplog):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    assert share_of([Job(4)] * 9, 8, 8) == shares.Share(8, 4)
+    assert share_of([Job(4)] * 9, 8, 8) == launchers.Share(8, 4)
     assert "8 jobs at once of 4 threads are more than the 8 cores" in caplog.text
     with pytest.raises(InputError, match=r"hydra\.launcher\.n_jobs: 0; allowed"):
         share_of([Job()], 0, 8)

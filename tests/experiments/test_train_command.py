@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 
 from dolens.cli.app import app
 from dolens.experiments.running.catalogue import user_configuration
-from dolens.experiments.running.completion import completions
-from dolens.experiments.running.user_configuration import use_working_folder
+from dolens.experiments.running.user_configuration import completions, use_working_folder
 
 OWN_FILES = {
     "conf/experiment/mine.yaml": """

@@ -16,7 +16,7 @@ from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.evaluate import evaluate
 from dolens.experiments.commands.export import ExportSettings, export_run
 from dolens.experiments.running.finished_run import load_run
-from dolens.experiments.running.plain_values import walk
+from dolens.experiments.running.run_files import walk
 from dolens.experiments.running.trust import allowed_targets, needing_trust
 
 COMMANDS = {
@@ -46,7 +46,7 @@ CALLS = {
         "source": "local",
     },
     "a function of dolens": {
-        "_target_": "dolens.experiments.running.extensions.import_extensions",
+        "_target_": "dolens.experiments.running.user_configuration.import_extensions",
         "modules": ["module_of_a_stranger"],
     },
     "another one": {"_target_": "dolens.prescriptions.save_lens", "path": "executed"},

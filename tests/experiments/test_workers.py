@@ -15,8 +15,8 @@ from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.workers import workers_of
-from dolens.experiments.workers.own_threads import OwnThreads
-from dolens.experiments.workers.ray_workers import RayWorkers
+from dolens.experiments.workers.ray_cluster import RayWorkers
+from dolens.experiments.workers.workers import OwnThreads
 from dolens.tasks import TaskError, in_turn, listening
 from dolens.tolerancing import tolerances_from, trace_perturbed
 

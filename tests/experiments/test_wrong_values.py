@@ -15,16 +15,15 @@ from dolens.alignment.measurement import read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import unmodelled_of
 from dolens.errors import InputError
-from dolens.experiments.camera.lens_least_squares import CameraOptimizer
-from dolens.experiments.poses.accuracy_settings import BasinSettings
-from dolens.experiments.poses.alignment_settings import Misalignments
-from dolens.experiments.poses.settings import fit_plan, plain_imager
+from dolens.experiments.camera.lens_optimizer import CameraOptimizer
+from dolens.experiments.poses.accuracy_tasks import BasinSettings
+from dolens.experiments.poses.fit_plan import fit_plan, plain_imager
+from dolens.experiments.poses.triplet_alignment import Misalignments
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.running.failed_parts import reason_of
-from dolens.experiments.running.machine_faults import machine_fault
-from dolens.experiments.running.resolvers import total_steps
+from dolens.experiments.running.faults import machine_fault, reason_of
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
+from dolens.experiments.settings import total_steps
 from dolens.optimize import MeritSettings
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import load_lens

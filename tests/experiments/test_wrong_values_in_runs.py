@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.experiments.running.checkpoint_files import read_checkpoint
-from dolens.experiments.running.choices import no_choice
+from dolens.experiments.running.checkpoints import read_checkpoint
+from dolens.experiments.running.command_line import no_choice
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 # Of a search for a lens, where the merit and its optimizer take them.

@@ -6,7 +6,7 @@ import torch
 from matplotlib.patches import Ellipse
 
 from dolens.errors import InputError
-from dolens.experiments.poses.labels import image_labels
+from dolens.experiments.poses.pose_figures import image_labels
 from dolens.plotting.parameter_fits import convergence_figure, corner_figure
 from dolens.plotting.pictures import spot_fit_figure
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import distributed, nn
 
-from dolens.experiments.camera.adversary import Adversary
+from dolens.experiments.camera.training import Adversary
 from dolens.reconstruction.adversarial import (
     PatchDiscriminator,
     RelativisticDiscriminators,

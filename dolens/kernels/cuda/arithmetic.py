@@ -17,7 +17,7 @@ import triton
 import triton.language as tl
 
 from dolens.kernels import limits
-from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
+from dolens.kernels.limits import LONGEST_WAVEVECTOR, STEEPEST
 
 GRAZING, TINY = tl.constexpr(limits.GRAZING), tl.constexpr(limits.TINY)
 _LONGEST = tl.constexpr(limits.LONGEST)
@@ -141,7 +141,7 @@ def add_by_column(front, behind, column, of_front, of_behind, alive):
         left = left & (column != wavelength)
 
 
-_LONGEST_DISTANCE, _STEEPEST = tl.constexpr(LONGEST), tl.constexpr(STEEPEST)
+_STEEPEST = tl.constexpr(STEEPEST)
 _LONGEST_WAVEVECTOR = tl.constexpr(LONGEST_WAVEVECTOR)
 
 
@@ -160,9 +160,9 @@ def deflect(phase, px, py, l, m, n, nx, ny, nz, index, ratio, per_radian, sense)
     squared = tl.where(tl.abs(gx) + tl.abs(gy) < _STEEPEST, squared, -1.0)
     change = sense * safe_sqrt(squared) - along
     return (
-        clamp(ax + change * nx, _LONGEST_DISTANCE),
-        clamp(ay + change * ny, _LONGEST_DISTANCE),
-        clamp(az + change * nz, _LONGEST_DISTANCE),
+        clamp(ax + change * nx, _LONGEST),
+        clamp(ay + change * ny, _LONGEST),
+        clamp(az + change * nz, _LONGEST),
         squared,
         per_radian * phase,
     )

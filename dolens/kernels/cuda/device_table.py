@@ -2,8 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -108,19 +106,6 @@ def prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
     ratio = front / indices[:, codes.after]
     media = torch.stack((front, ratio, indices[:, codes.waves]), 2).to(like.dtype)
     return codes, media.expand(lenses, -1, -1, -1)
-
-
-@cache
-def _announce() -> None:
-    logger.info(
-        "compiling kernels for the GPU (some seconds a lens, unless Triton's cache has them)"
-    )
-
-
-def on(device: torch.device) -> AbstractContextManager[object]:
-    """Launch there, whichever GPU is the current one."""
-    _announce()
-    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 class DeviceEntries(NamedTuple):

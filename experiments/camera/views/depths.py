@@ -1,7 +1,8 @@
-"""Every texture at every depth of a scene: what an extended depth of field is about."""
+"""Textures at depths of a scene: each on every plane, or in layers that hide each other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.base import SCENE_OFFSET, Comparison, Imaging, Views, seed_of
 from dolens.experiments.camera.views.truth import (
     check_truth,
     reference_chief_ray_map,
@@ -29,10 +30,11 @@ from dolens.rendering.exit_pupil import axial_f_number
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.scene.layered import LayeredScene
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene, resized
 from dolens.sensor.colour import linear_to_srgb
-from dolens.sensor.noise import BatchShare
+from dolens.sensor.noise import BatchShare, generator_of
 from dolens.sensor.readout import Readout
 
 
@@ -252,3 +254,117 @@ class DepthViews(Imaging):
                 )
             )
         return found
+
+
+class LayerViews(DepthViews):
+    """Scenes with a depth at every texel, in front of the whole sensor.
+
+    Textures that have a depth as their last channel are taken as they are; photographs are given
+    one, with edges where near things hide far ones, drawn from the seed, the stage and the index.
+
+    Args:
+        scene: the planes.
+        occluders: ellipses in front of each photograph.
+        **settings: those of `DepthViews`.
+
+    Raises:
+        InputError: the scene is not one of layers.
+    """
+
+    def __init__(self, scene: LayeredScene, occluders: int = 8, **settings: Any) -> None:
+        super().__init__(scene, **settings)
+        if not isinstance(scene, LayeredScene):
+            raise InputError("views: layers need a scene of layers; choose scene=layers")
+        self.occluders = occluders
+
+    def take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        reference: str | None = None,
+        share: BatchShare | None = None,
+    ) -> Views:
+        """One image of each texture."""
+        if textures.shape[1] == len(self.scene.wavelengths):
+            generator = generator_of(seed_of(self.seed, stage, index) + SCENE_OFFSET)
+            near, far = self.scene.depths[0], self.scene.depths[-1]
+            before = 0 if share is None else share.first
+            textures = with_occluders(textures, near, far, self.occluders, generator, before)
+        return super().take(lens, values, textures, stage, index, reference, share)
+
+
+def with_occluders(
+    textures: Tensor,
+    nearest: float,
+    farthest: float,
+    count: int,
+    generator: torch.Generator,
+    before: int = 0,
+) -> Tensor:
+    """Give photographs a depth: a slanted background, and ellipses in front of it.
+
+    Vergences, 1/depth, are drawn evenly, so that blurs are.  The background takes the farther half
+    of the range; ellipses are painted from far to near, each with a part of the photograph that
+    lies elsewhere, since an edge in depth is seen by what changes there.
+
+    Args:
+        textures: (B, C, H, W), linear light.
+        nearest: mm in front of the first vertex.
+        farthest: mm.
+        count: ellipses in each image.
+        generator: of the random numbers, on the CPU.
+        before: photographs whose random numbers come before: of a batch, of which these are a part.
+
+    Returns:
+        (B, C + 1, H, W), as `LayeredScene` takes them: the depth is the last channel.
+
+    Raises:
+        InputError: the depths are not positive or not in order, or the count is negative.
+    """
+    if not 0.0 < nearest <= farthest:
+        raise InputError(f"occluders: depths {nearest:g} and {farthest:g} mm; allowed: 0 < a <= b")
+    if count < 0:
+        raise InputError(f"occluders: {count} of them; allowed: 0 or more")
+    near, far = 1.0 / nearest, 1.0 / farthest
+    for _ in range(before):
+        _drawn(count, generator)
+    return torch.stack([_scene(image, near, far, count, generator) for image in textures])
+
+
+def _scene(
+    image: Tensor, near: float, far: float, count: int, generator: torch.Generator
+) -> Tensor:
+    height, width = image.shape[-2:]
+    options = {"dtype": torch.float64, "device": image.device}
+    row = torch.linspace(-1.0, 1.0, height, **options)[:, None]
+    column = torch.linspace(-1.0, 1.0, width, **options)
+    middle = 0.5 * (near + far)
+    (angle, tilt), drawn = _drawn(count, generator)
+    turn = torch.tensor(2.0 * torch.pi * angle, **options)
+    slope = (row * turn.sin() + column * turn.cos()) / 2.0**0.5
+    vergence = far + (middle - far) * (0.5 + 0.5 * tilt * slope)
+    light = image
+    # From far to near: the later one hides the earlier one.
+    for shares in drawn[drawn[:, 0].argsort()].tolist():
+        place, down, across, long, short, shift_down, shift_across = shares
+        radii = 0.15 + 0.35 * long, 0.15 + 0.35 * short
+        inside = ((row - (2.0 * down - 1.0)) / radii[0]).square() + (
+            (column - (2.0 * across - 1.0)) / radii[1]
+        ).square() < 1.0
+        # Between a quarter and three quarters of the image away.
+        shifts = (
+            round(height * (0.25 + 0.5 * shift_down)),
+            round(width * (0.25 + 0.5 * shift_across)),
+        )
+        light = torch.where(inside, image.roll(shifts, (-2, -1)), light)
+        vergence = torch.where(inside, middle + (near - middle) * place, vergence)
+    return torch.cat((light, (1.0 / vergence)[None].to(image)))
+
+
+def _drawn(count: int, generator: torch.Generator) -> tuple[list[float], Tensor]:
+    """Draw the random numbers of one photograph: of its background, and of its ellipses."""
+    background = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    return background, torch.rand(count, 7, generator=generator, dtype=torch.float64)

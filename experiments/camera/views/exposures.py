@@ -19,7 +19,7 @@ from dolens.experiments.camera.views.base import (
     seed_of,
 )
 from dolens.experiments.camera.views.whole import Placing, WholePicture
-from dolens.experiments.checks import check_positive
+from dolens.experiments.settings import check_positive
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state, values_there
 from dolens.reconstruction.likelihood import estimated_motion

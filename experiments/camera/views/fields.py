@@ -10,14 +10,17 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
-from dolens.experiments.camera.views.centroids import reference_centroid_map
-from dolens.experiments.camera.views.field_functions import field_functions, field_imaging
-from dolens.experiments.camera.views.field_windows import FieldWindows
+from dolens.experiments.camera.views.field_windows import (
+    FieldWindows,
+    field_functions,
+    field_imaging,
+)
 from dolens.experiments.camera.views.truth import (
     CENTROIDS,
     TRUTHS,
     check_truth,
     nearest_texel,
+    reference_centroid_map,
     reference_chief_ray_map,
     sample_texture,
 )

@@ -2,10 +2,9 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
+from dolens.experiments.data.crop_loading import EvaluationCrops, ResumableSampler, TrainingCrops
 from dolens.experiments.data.crops import centred_crops, random_crop
 from dolens.experiments.data.photographs import Photograph
-from dolens.experiments.data.resumable import ResumableSampler
 
 
 def _photographs(count):

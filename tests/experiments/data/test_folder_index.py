@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.experiments.data import folder_listing, headers, index_files
+from dolens.experiments.data import folder_index, index_files
+from dolens.experiments.data.folder_index import PackedNames
 from dolens.experiments.data.image_folder import ImageFolderDataModule
 from dolens.experiments.data.index_files import IndexFile
-from dolens.experiments.data.packed_names import PackedNames
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 14, 3), dtype=np.uint8)
 # Names whose order as text differs from that of their parts, and one that is no UTF-8.
@@ -31,7 +31,7 @@ def settled(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(index_files, "user_cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setattr(index_files, "LEAST", 1)
-    monkeypatch.setattr(folder_listing, "_SAME_TIME", -60.0)
+    monkeypatch.setattr(folder_index, "_SAME_TIME", -60.0)
 
 
 def image(path: Path, pixels: np.ndarray = PIXELS) -> Path:
@@ -85,7 +85,9 @@ def test_a_second_start_opens_no_file(settled, tmp_path, monkeypatch, caplog):
     (root / "broken.png").write_bytes(b"no image")
     first = split(data(root))
     opened = []
-    monkeypatch.setattr(headers, "probe_picture", lambda path, _: opened.append(path) or "broken")
+    monkeypatch.setattr(
+        index_files, "probe_picture", lambda path, _: opened.append(path) or "broken"
+    )
     monkeypatch.setattr(os, "scandir", None)
     with caplog.at_level(logging.INFO):
         again = data(root)
@@ -100,9 +102,9 @@ def test_files_that_come_and_go_are_noticed(settled, tmp_path, monkeypatch, capl
     image(root / "n1" / "new.png")
     (root / NAMES[0]).unlink()
     image(root / "deep" / "er" / "new.png")
-    opened, probe = [], headers.probe_picture
+    opened, probe = [], index_files.probe_picture
     monkeypatch.setattr(
-        headers, "probe_picture", lambda path, _: opened.append(path) or probe(path, 64)
+        index_files, "probe_picture", lambda path, _: opened.append(path) or probe(path, 64)
     )
     with caplog.at_level(logging.INFO):
         found = split(data(root))
@@ -113,7 +115,7 @@ def test_files_that_come_and_go_are_noticed(settled, tmp_path, monkeypatch, capl
 
 def test_a_folder_that_changed_just_now_is_read_again(settled, tmp_path, monkeypatch):
     """File systems with coarse times would hide a second change."""
-    monkeypatch.setattr(folder_listing, "_SAME_TIME", 60.0)
+    monkeypatch.setattr(folder_index, "_SAME_TIME", 60.0)
     root = folder(tmp_path / "root")
     split(data(root))
     status = root.stat()
@@ -181,7 +183,7 @@ def test_a_pipe_is_not_waited_for(settled, tmp_path, caplog):
 
 def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatch):
     root = folder(tmp_path / "root")
-    probe, opened = headers.probe_picture, []
+    probe, opened = index_files.probe_picture, []
 
     def until_interrupted(path, megapixels):
         opened.append(path)
@@ -189,7 +191,7 @@ def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatc
             raise KeyboardInterrupt
         return probe(path, megapixels)
 
-    monkeypatch.setattr(headers, "probe_picture", until_interrupted)
+    monkeypatch.setattr(index_files, "probe_picture", until_interrupted)
     with pytest.raises(KeyboardInterrupt):
         split(data(root))
     split(data(root))

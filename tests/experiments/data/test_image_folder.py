@@ -6,8 +6,8 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.experiments.data.folder_photographs import FolderPhotographs
 from dolens.experiments.data.image_folder import ImageFolderDataModule
+from dolens.experiments.data.photographs import FolderPhotographs
 
 
 def _image(path, value=0):

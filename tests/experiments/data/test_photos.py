@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.experiments.data import photos
-from dolens.experiments.data.photos import PhotosDataModule
+from dolens.experiments.data import package_photographs
+from dolens.experiments.data.package_photographs import PhotosDataModule
 
 
 def test_default_splits_are_disjoint_and_installed():
@@ -53,6 +53,6 @@ def test_an_empty_split_is_an_error():
 
 
 def test_a_missing_file_names_the_version(tmp_path, monkeypatch):
-    monkeypatch.setattr(photos, "photographs_folder", lambda: tmp_path)
+    monkeypatch.setattr(package_photographs, "photographs_folder", lambda: tmp_path)
     with pytest.raises(InputError, match=r"rocket\.jpg: missing from scikit-image \d"):
         PhotosDataModule().setup("validate")

@@ -9,9 +9,8 @@ from PIL import Image
 
 from dolens.errors import InputError
 from dolens.experiments.data.crops import centred_crop, random_crop
-from dolens.experiments.data.depth_maps import read_depth_map
+from dolens.experiments.data.image_folder import RgbdFolderDataModule, read_depth_map
 from dolens.experiments.data.photographs import Photograph
-from dolens.experiments.data.rgbd_folder import RgbdFolderDataModule
 from dolens.experiments.running.training import run
 from dolens.rendering.auto.probes import probe_texture
 from dolens.sensor.pixels import Sensor

@@ -7,18 +7,16 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.experiments.report.checks import State, outcomes
-from dolens.experiments.report.gains import gain_numbers
-from dolens.experiments.report.page.material import Material
-from dolens.experiments.report.page.numbers import (
+from dolens.experiments.report.checks import Material, State, outcomes
+from dolens.experiments.report.page.overview import (
+    gain_sentence,
     number_text,
     seconds_text,
     step_text,
     value_text,
 )
-from dolens.experiments.report.page.overview import gain_sentence
 from dolens.experiments.report.page.page import page
-from dolens.experiments.report.results import assigned, read_result, same_overrides
+from dolens.experiments.report.runs import assigned, gain_numbers, read_result, same_overrides
 from dolens.html import element, prose
 from tests.experiments.report.report_runs import CHECKS, PLAN, finished_run
 
@@ -166,7 +164,7 @@ def test_a_gain_is_said_with_its_interval(low, high, verdict):
 
 
 def test_the_fingerprint_is_short_and_stable():
-    from dolens.experiments.report.code_version import code_fingerprint
+    from dolens.experiments.report.runs import code_fingerprint
 
     first = code_fingerprint()
     code_fingerprint.cache_clear()
@@ -175,7 +173,7 @@ def test_the_fingerprint_is_short_and_stable():
 
 def test_the_golden_rays_are_met():
     """One bundle; the report traces them all."""
-    from dolens.experiments.report.golden_rays import load_golden_rays, trace_errors
+    from dolens.experiments.report.prescriptions import load_golden_rays, trace_errors
 
     bundles = [bundle for bundle in load_golden_rays() if bundle["name"] == "cooke_triplet_tilted"]
     assert trace_errors(bundles)["trace_error_nm/cooke_triplet_tilted"] < 1e-5

@@ -10,8 +10,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from dolens.errors import InputError
 from dolens.experiments.report.checks import Check, load_checks
-from dolens.experiments.report.golden_rays import load_golden_rays
 from dolens.experiments.report.plan import load_plan
+from dolens.experiments.report.prescriptions import load_golden_rays
 
 ROOT = Path(__file__).resolve().parents[3]
 # The names of the metrics of each system, from real runs of the report.

@@ -7,12 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from dolens.cli.app import app
-from dolens.experiments.report import assemble, runner, session
+from dolens.experiments.report import runs, session
 from dolens.experiments.report.checks import Check
 from dolens.experiments.report.plan import Item, Plan, Section, System
-from dolens.experiments.report.progress import Pace
-from dolens.experiments.report.runner import is_current, last_words, run_system
-from dolens.experiments.report.session import Choice, make_report
+from dolens.experiments.report.runs import is_current, last_words, run_system
+from dolens.experiments.report.session import Choice, Pace, make_report
 from tests.experiments.report.report_runs import PLAN, finished_run
 
 WRITES = """
@@ -70,7 +69,7 @@ def plan(tmp_path, monkeypatch):
         Check("S1", "writes", "number", "one", "exact", "s", 1.0, 0.1),
         Check("S1", "fails", "number", "one", "exact", "s", 1.0, 0.1),
     )
-    monkeypatch.setattr(assemble, "load_checks", lambda plan: checks)
+    monkeypatch.setattr(session, "load_checks", lambda plan: checks)
     monkeypatch.setattr(session, "load_checks", lambda plan: checks)
     return Plan(systems, (), (Section("One", (item,)),))
 
@@ -113,7 +112,7 @@ def test_an_interrupt_ends_the_run_and_writes_the_page(plan, tmp_path, monkeypat
                 raise KeyboardInterrupt
 
     # No terminal interrupts the run beside the report here, so there is nothing to wait for.
-    monkeypatch.setattr(runner, "_FIRST_GRACE_S", 0.0)
+    monkeypatch.setattr(runs, "_FIRST_GRACE_S", 0.0)
     sleeping = System("writes", "w", 1.0, module="report_sleeps")
     plan = Plan((sleeping,), (), ())
     with pytest.raises(KeyboardInterrupt):

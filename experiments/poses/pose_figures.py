@@ -1,0 +1,396 @@
+"""Figures of fitted poses, and of Cramér–Rao bounds for arrangements of sources and planes."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from torch import Tensor
+
+from dolens.alignment.information import FisherInformation
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.pose import Pose
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.fit_plan import Fit, Stage
+from dolens.experiments.poses.fitting import Estimates
+from dolens.experiments.tables import Row
+from dolens.optics.lens import Lens
+from dolens.plotting.layout import lens_title
+from dolens.plotting.parameter_fits import convergence_figure, corner_figure
+from dolens.plotting.pictures import spot_fit_figure
+from dolens.plotting.style import (
+    DASHES,
+    MARKERS,
+    MINUS,
+    PAGE,
+    SMALL,
+    colours,
+    draw_title,
+    legend_below,
+    log_ticks,
+    number_text,
+    ruled_axes,
+)
+from dolens.rendering.spot_image import SpotImage
+from dolens.sensor.pixels import Sensor
+
+
+def variable_label(name: str) -> str:
+    """Return a label for people.
+
+    `elements.lens.tilt_x` becomes `lens tilt x`, `sources.1.z` `source 1 z`, and `sources.*.z`
+    `sources z`.
+    """
+    short = name.removeprefix("elements.").replace("sources.*.", "sources ")
+    short = short.replace("sources.", "source ")
+    return short.replace(".", " ").replace("_", " ")
+
+
+def image_labels(sources: int, planes: Sequence[float]) -> list[str]:
+    """Return the source and the plane (mm) of each image, as far as there are several.
+
+    The images of a source on all planes follow one another, as `Pose.images` gives them.
+    """
+    return [
+        (f", source {source + 1}" if sources > 1 else "")
+        + (f"\nplane {number_text(plane)} mm" if len(planes) > 1 else "")
+        for source in range(sources)
+        for plane in planes
+    ]
+
+
+# An eigenvector with a larger standard deviation, in the scales, is not seen at all.
+UNSEEN = 1e4
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Holds sources and planes, and the information in their images.
+
+    Attributes:
+        name: of the arrangement.
+        pose: the lens where it is; its variables are what is unknown.
+        information: that the images carry on it.
+        spread: (P,), standard deviations along the eigenvectors of θ/scale, the largest first.
+        eigenvectors: (P, P), of the Fisher information, one a row.
+        estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
+    """
+
+    name: str
+    pose: Pose
+    information: FisherInformation
+    spread: Tensor
+    eigenvectors: Tensor
+    estimates: Tensor | None
+
+    @property
+    def bounds(self) -> Tensor:
+        """Return bounds (P,), degrees and mm."""
+        return self.information.bounds / self.pose.units
+
+
+_LOSS_LABELS = {"s21": "loss S21 (no unit)", "noise_weighted": "χ² per pixel (no unit)"}
+
+
+class FittedPoses(Protocol):
+    """Describes poses that were fitted to measurements, one fit after another.
+
+    Attributes:
+        lens: as designed.
+        sensor: the pixels.
+        fits: settings of each fit.
+        poses: the pose of each fit, as it was found.
+        stages: of every fit.
+        initial: (P,), the variables where each fit began.
+        history: a row of numbers for every iteration.
+        information: name of a fit → the information in its measurement.
+        estimates: name of a fit → estimates from other measurements, where there are any.
+    """
+
+    lens: Lens
+    sensor: Sensor
+    fits: Sequence[Fit]
+    poses: Sequence[Pose]
+    stages: Sequence[Stage]
+    initial: Sequence[Tensor]
+    history: Sequence[Row]
+    information: Mapping[str, FisherInformation]
+    estimates: Mapping[str, Estimates]
+
+    def truth(self, number: int) -> Mapping[str, float]:
+        """Return the true values of a fit's variables, as far as they are known."""
+
+    def measurement(self, number: int) -> Measurement:
+        """Return the measurement of a fit."""
+
+    def images(self, number: int, scaled: Tensor | None = None) -> Sequence[SpotImage]:
+        """Return the images of a fit's pose, or of other values of its variables."""
+
+
+def misalignment_figures(fitted: FittedPoses) -> Figures:
+    """Return `spots`, and for each fit `convergence_<fit>` and `corner_<fit>`.
+
+    A fit that made no iteration has no convergence.
+    """
+    figures = {"spots": partial(_spots, fitted)}
+    for number, fit in enumerate(fitted.fits):
+        if any(row["fit"] == fit.name for row in fitted.history):
+            figures[f"convergence_{fit.name}"] = partial(_convergence, fitted, number)
+        figures[f"corner_{fit.name}"] = partial(_corner_of_fit, fitted, number)
+    return figures
+
+
+def _spots(fitted: FittedPoses) -> Figure:
+    measured, initial, final, labels = [], [], [], []
+    for number, fit in enumerate(fitted.fits):
+        measurement = fitted.measurement(number)
+        shares = measurement.shares
+        measured.append(shares)
+        for kept, scaled in ((initial, fitted.initial[number]), (final, None)):
+            images = enumerate(fitted.images(number, scaled))
+            kept.append(torch.stack([measurement.as_seen(image, s)[0] for s, image in images]))
+        pose = fitted.poses[number]
+        labels += [f"fit {fit.name}{of}" for of in image_labels(len(pose.sources), pose.planes)]
+    return spot_fit_figure(
+        torch.cat(measured),
+        torch.cat(initial),
+        torch.cat(final),
+        labels,
+        fitted.sensor.pixel_pitch,
+        f"{lens_title(fitted.lens)}\nimages of point sources, measured and modelled",
+    )
+
+
+def _convergence(fitted: FittedPoses, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    rows = [row for row in fitted.history if row["fit"] == fit.name]
+    stages = [
+        (optimizer, len(list(group)))
+        for (_, optimizer), group in itertools.groupby(
+            rows, key=lambda row: (row["stage"], row["optimizer"])
+        )
+    ]
+    values = {
+        variable_label(name): ([float(row[name]) for row in rows], unit)
+        for name, unit in zip(pose.names, pose.unit_names, strict=True)
+    }
+    truth = fitted.truth(number)
+    return convergence_figure(
+        _losses(fitted, rows),
+        values,
+        stages,
+        {variable_label(name): truth[name] for name in pose.names if name in truth},
+        f"{lens_title(fitted.lens)}\nconvergence of fit {fit.name}",
+    )
+
+
+def _losses(fitted: FittedPoses, rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Return the losses by name, NaN in stages of another one."""
+    # Stages count from 1 in the history.
+    of_stage = [str(fitted.stages[int(row["stage"]) - 1].loss) for row in rows]
+    found = [float(row["loss"]) for row in rows]
+    return {
+        _LOSS_LABELS.get(name, name): [
+            value if own == name else math.nan for value, own in zip(found, of_stage, strict=True)
+        ]
+        for name in dict.fromkeys(of_stage)
+    }
+
+
+def _corner_of_fit(fitted: FittedPoses, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    units = pose.units.cpu()
+    covariance = fitted.information[fit.name].covariance.cpu() / torch.outer(units, units)
+    found = torch.tensor([pose.file_values()[name] for name in pose.names], dtype=torch.float64)
+    truth = fitted.truth(number)
+    true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
+    estimates = fitted.estimates.get(fit.name)
+    points = None if estimates is None else estimates.values
+    # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
+    about_truth = points is not None and bool(true.isfinite().all())
+    return corner_figure(
+        covariance,
+        [variable_label(name) for name in pose.names],
+        pose.unit_names,
+        true if about_truth else found,
+        points,
+        true if truth else None,
+        f"{lens_title(fitted.lens)}\nhow well fit {fit.name} knows its pose (Cramér–Rao)",
+    )
+
+
+def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
+    """Return `knowledge`, and `corner_<arrangement>` of those that tell all variables.
+
+    Args:
+        arrangements: what was found.
+        name: the lens and its aperture, for titles.
+        photons: of all images of an arrangement together.
+    """
+    figures = {"knowledge": partial(_overview, arrangements, name, photons)}
+    for found in arrangements:
+        if float(found.spread[0]) < UNSEEN:
+            figures[f"corner_{found.name}"] = partial(_corner_of_bounds, found, name)
+    return figures
+
+
+def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figure:
+    rows = len(_names(arrangements))
+    heights = (0.36 * rows + 0.7, 3.0, 0.42 * len(arrangements) + 1.2)
+    figure = Figure(figsize=(PAGE, sum(heights) + 1.1), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1, height_ratios=heights)
+    _bounds(top, arrangements)
+    _spectrum(middle, arrangements)
+    _worst(bottom, arrangements, figure)
+    for axes, letter in zip((top, middle, bottom), "abc", strict=True):
+        axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
+    handles, labels = middle.get_legend_handles_labels()
+    unseen = Line2D([], [], color="0.3", marker=">", markerfacecolor="none", linestyle="none")
+    legend_below(figure, [*handles, unseen], 2, [*labels, "cannot be seen"])
+    draw_title(
+        figure,
+        f"{name}\nCramér–Rao bounds of its pose from images of {number_text(photons)} photons "
+        "in all",
+    )
+    return figure
+
+
+def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw bounds of each variable over its scale, a mark for each arrangement."""
+    names = _names(arrangements)
+    units = {
+        n: u for f in arrangements for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
+    }
+    scales = {
+        n: float(s)
+        for f in arrangements
+        for n, s in zip(f.pose.names, f.pose.file_scale, strict=True)
+    }
+    far = 0.0
+    for found in arrangements:
+        for name, bound in zip(found.pose.names, found.bounds.tolist(), strict=True):
+            share = bound / scales[name]
+            far = max(far, share if share < UNSEEN else 0.0)
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
+        for row, name in enumerate(names):
+            if name not in found.pose.names:
+                continue
+            share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
+            seen = share < UNSEEN
+            offset = 0.17 * (number - 0.5 * (len(arrangements) - 1))
+            axes.plot(
+                share if seen else 8.0 * far,
+                row + offset,
+                MARKERS[number % len(MARKERS)] if seen else ">",
+                color=colour,
+                markersize=5 if seen else 7,
+                markerfacecolor=colour if seen else "none",
+            )
+    labels = [
+        f"{variable_label(name)}\n(scale {scales[name]:g}{_unit(units[name])})" for name in names
+    ]
+    axes.set_yticks(range(len(names)), labels, fontsize=SMALL)
+    axes.set_xscale("log")
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlabel("bound over the scale of the variable (no unit)", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    log_ticks(axes.xaxis)
+
+
+def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw standard deviations along the eigenvectors, from the largest to the smallest."""
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
+        spread = found.spread.clone()
+        unseen = int((spread > UNSEEN).sum())
+        spread[:unseen] = torch.nan
+        label = _label(found) if not unseen else f"{_label(found)} ({unseen} cannot be seen)"
+        axes.plot(
+            np.arange(1, len(spread) + 1),
+            spread.numpy(),
+            marker=MARKERS[number % len(MARKERS)],
+            color=colour,
+            linewidth=1.0,
+            linestyle=DASHES[number % len(DASHES)],
+            markersize=5,
+            label=label,
+        )
+    axes.set_yscale("log")
+    axes.set_xlabel("number of the eigenvector, from the largest variance", fontsize=SMALL + 1)
+    axes.set_ylabel("standard deviation\n(in scales, no unit)", fontsize=SMALL + 1)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ruled_axes(axes)
+
+
+def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
+    """Draw the parts of the eigenvector of largest variance of each arrangement."""
+    names = _names(arrangements)
+    table = np.full((len(arrangements), len(names)), np.nan)
+    for row, found in enumerate(arrangements):
+        worst = found.eigenvectors[0]
+        # Of one sign: its largest part is positive.
+        worst = worst * torch.sign(worst[worst.abs().argmax()])
+        for name, part in zip(found.pose.names, worst.tolist(), strict=True):
+            table[row, names.index(name)] = part
+    shown = axes.imshow(table, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
+    for row, column in np.argwhere(np.isfinite(table)):
+        value = table[row, column]
+        if abs(value) >= 0.005:
+            text = f"{value:+.2f}".replace("-", MINUS)
+            pale = "white" if abs(value) > 0.6 else "black"
+            axes.text(column, row, text, ha="center", va="center", fontsize=SMALL - 1, color=pale)
+    axes.set_facecolor("0.93")
+    labels = []
+    for found in arrangements:
+        spread = float(found.spread[0])
+        labels.append(
+            f"{_label(found)}\nσ = {spread:.2g}" if spread < UNSEEN else f"{_label(found)}\n∞"
+        )
+    axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
+    axes.set_xticks(
+        range(len(names)),
+        [variable_label(n).replace(" ", "\n", 1) for n in names],
+        fontsize=SMALL - 1,
+    )
+    axes.set_xlabel("parts of the eigenvector of largest variance (no unit)", fontsize=SMALL + 1)
+    bar = figure.colorbar(shown, ax=axes, pad=0.01)
+    bar.ax.tick_params(labelsize=SMALL)
+    bar.set_label("part (no unit)", fontsize=SMALL)
+
+
+def _corner_of_bounds(found: Arrangement, name: str) -> Figure:
+    units = found.pose.units
+    values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
+    return corner_figure(
+        found.information.covariance / torch.outer(units, units),
+        [variable_label(name) for name in found.pose.names],
+        found.pose.unit_names,
+        values,
+        found.estimates,
+        values if found.estimates is not None else None,
+        f"{name}\n{_label(found)}: Cramér–Rao bounds",
+    )
+
+
+def _unit(unit: str) -> str:
+    return "°" if unit == "deg" else f" {unit}"
+
+
+def _label(found: Arrangement) -> str:
+    return found.name.replace("_", " ")
+
+
+def _names(arrangements: Sequence[Arrangement]) -> list[str]:
+    """Return the names of all variables of all arrangements."""
+    return list(dict.fromkeys(name for f in arrangements for name in f.pose.names))
+
+
+def _coloured(arrangements: Sequence[Arrangement]) -> zip:
+    return zip(arrangements, colours(len(arrangements)), strict=True)
