@@ -38,8 +38,8 @@ from dolens.tolerancing import (
     Tolerances,
     contributions,
     fields_all_around,
+    linear_spots,
     sensitivities,
-    sensitivity,
     spot_weights,
     tolerances_from,
     usual_tolerances,
@@ -152,7 +152,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         where.object_distance,
         symmetry=False,
     )
-    model = sensitivity(lens, spots, tolerances.names)
+    model = linear_spots(lens, spots, tolerances.names)
     of_fields = where.weights.new_tensor(list(fields.values()))
     weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
     return Offenders(

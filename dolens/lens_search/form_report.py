@@ -33,8 +33,8 @@ from dolens.tolerancing import (
     Yield,
     contributions,
     fields_all_around,
+    linear_spots,
     quantiles,
-    sensitivity,
     spot_weights,
     tolerances_from,
     usual_tolerances,
@@ -198,7 +198,7 @@ def lens_sensitivity(lens: Lens) -> LensSensitivity:
     )
     of_fields = where.weights.new_tensor(list(fields.values()))
     weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
-    model = sensitivity(made, spots, tolerances.names)
+    model = linear_spots(made, spots, tolerances.names)
     adding = contributions(model, tolerances, weights)
     errors = tolerances.draw(_LENSES, torch.Generator().manual_seed(_SEED))
     curves = model.focus_curves(errors)

@@ -98,7 +98,7 @@ def file_value(name: str, value: float) -> float | None:
     return None
 
 
-StateValue = TypeVar("Value")
+StateValue = TypeVar("StateValue")
 
 # They begin with this.
 STATES = "states"

@@ -24,7 +24,7 @@ class Status(IntEnum):
 
 
 def arrives(status: Tensor) -> Tensor:
-    """Return which rays reach the sensor where nothing clips them: OK and VIGNETTED, of any shape."""
+    """Return which rays reach the sensor where nothing clips them, (...): OK and VIGNETTED."""
     return (status == Status.OK) | (status == Status.VIGNETTED)
 
 

@@ -107,9 +107,9 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         lens: whose parameters they are of, and whose present values are the design.
         settings: name or pattern, of a parameter or of what
             `dolens.optics.fabrication_errors` names (`media.2.index_offset`,
-            `surfaces.*.astigmatism_*`) → half-range (degrees for tilts, mm, 1/mm), uniform; or → a mapping of `half_range`, `distribution` (`uniform` or
-            `normal`) and `relative` (the half-range is a share of the value); None leaves a pattern
-            out.
+            `surfaces.*.astigmatism_*`) → half-range (degrees for tilts, mm, 1/mm), uniform; or → a
+            mapping of `half_range`, `distribution` (`uniform` or `normal`) and `relative` (the
+            half-range is a share of the value); None leaves a pattern out.
         factor: multiplies every half-range.
 
     Raises:
