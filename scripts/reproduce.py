@@ -3,8 +3,7 @@
     python scripts/reproduce.py outputs/wavefront_coding/<date_time> [--into FOLDER]
 
 The overrides come from `.hydra/overrides.yaml`, the expected numbers from `metrics.json`.  When the
-code is not the commit that `run.json` names, the script says so and goes on; settings that have
-other names since then are translated, and each is named.
+code is not the commit that `run.json` names, the script says so and goes on.
 """
 
 import argparse
@@ -15,7 +14,6 @@ from pathlib import Path
 from dolens.errors import InputError
 from dolens.experiments.running.configuration import with_overrides
 from dolens.experiments.running.recorded_run import read_record
-from dolens.experiments.running.renaming import translated
 from dolens.experiments.running.run_files import info_of, metrics_of, overrides_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,9 +40,7 @@ def main() -> int:
     ).stdout.strip()
     if commit != here:
         print(f"note: the run was made by commit {commit}, this is {here}")
-    overrides, changes = translated([forced(override) for override in overrides])
-    for change in changes:
-        print(f"note: {change}")
+    overrides = [forced(override) for override in overrides]
     command = [sys.executable, str(ROOT / "train.py"), *overrides, f"hydra.run.dir={into}"]
     done = subprocess.run(command, cwd=ROOT, check=False)
     if done.returncode:

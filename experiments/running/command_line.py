@@ -12,7 +12,9 @@ from typing import Any
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, did_you_mean, one_line, readable
 from dolens.experiments.running.catalogue import added_folders, configuration_folders, experiments
@@ -140,6 +142,33 @@ def override_text(value: Any) -> str:
     if isinstance(value, str) and (not _PLAIN.fullmatch(value) or value.lower() in _WORDS):
         return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
     return str(value)
+
+
+def explained(error: HydraException) -> str:
+    """Return what to say of a configuration that could not be composed.
+
+    That is the nearest setting or file, where there is none of that name; the error's own text
+    elsewhere.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        if group and error.options:
+            return (
+                f"{group}={option}: there is no such file{did_you_mean(option, error.options)} "
+                f"(there are: {', '.join(error.options)})"
+            )
+    if "You must specify 'experiment'" in str(error):
+        return "no experiment is named: give experiment=NAME; `dolens experiments` lists them"
+    cause = error.__cause__
+    node = getattr(cause, "parent_node", None)
+    if isinstance(cause, OmegaConfBaseException) and isinstance(node, DictConfig):
+        keys = [str(key) for key in node if not str(key).startswith("_")]
+        return (
+            f"{cause.full_key}: there is no such setting{did_you_mean(str(cause.key), keys)} "
+            f"(there are: {', '.join(keys) or 'none'}); one that has no value yet is set by "
+            f"+{cause.full_key}=..."
+        )
+    return str(error)
 
 
 def no_choice(overrides: Sequence[str]) -> str | None:

@@ -15,8 +15,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.catalogue import configuration_folders
+from dolens.experiments.running.command_line import explained
 from dolens.experiments.running.recorded_run import RecordedRun
-from dolens.experiments.running.renaming import explained, refuse_renamed
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.target_keys import (
     refuse_missing,
@@ -48,7 +48,6 @@ def checked(cfg: DictConfig) -> DictConfig:
             class takes, or a setting that nothing reads.
     """
     own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-    refuse_renamed(own)
     own = without_dropped(own)
     plain = OmegaConf.to_container(own, resolve=False)
     refuse_targets_in_lenses(plain)
@@ -127,7 +126,7 @@ def _composed(record: RecordedRun, overrides: Sequence[str]) -> Iterator[DictCon
             HydraConfig.instance().set_config(cfg)
             yield cfg
     except HydraException as error:
-        raise InputError(one_line(explained(error, overrides))) from error
+        raise InputError(one_line(explained(error))) from error
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
     finally:

@@ -15,9 +15,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.command_line import no_choice, prepared
+from dolens.experiments.running.command_line import explained, no_choice, prepared
 from dolens.experiments.running.faults import machine_fault, reason_of, thread_faults_in_one_line
-from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.trainer import own_arguments, report_failure
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
@@ -48,7 +47,7 @@ def main(arguments: Sequence[str], program: str) -> None:
             sys.argv = [program, *own]
             start()
     except HydraException as error:
-        sys.exit(f"error: {one_line(explained(error, arguments))}")
+        sys.exit(f"error: {one_line(explained(error))}")
     except (InputError, OmegaConfBaseException) as error:
         sys.exit(f"error: {one_line(error)}")
     except (OSError, ValueError) as error:  # as Hydra makes the folder of a run, and its log

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.renaming import translated, with_targets_of_now
 from dolens.experiments.running.run_files import (
     HYDRA,
     INFO,
@@ -25,6 +25,7 @@ from dolens.experiments.running.run_files import (
     walk,
 )
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.target_keys import Target, located
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 from dolens.files import resolved_path
 
@@ -39,8 +40,7 @@ class RecordedRun:
         folder: of the run, as it is now.
         config: the configuration that the run worked with, without interpolations; paths within the
             run folder lead to `output`.
-        overrides: of the command line, in the names of now.
-        notes: a line for each name that has changed since.
+        overrides: of the command line.
         choices: Hydra's choices, group → option.
         sources: folders of the configuration that the run was composed from, the main one first.
         info: run.json.
@@ -51,7 +51,6 @@ class RecordedRun:
     folder: Path
     config: Mapping[str, Any]
     overrides: tuple[str, ...]
-    notes: tuple[str, ...]
     choices: Mapping[str, str | None]
     sources: tuple[Path, ...]
     info: Mapping[str, Any]
@@ -110,24 +109,41 @@ def read_record(
         RunSettings.of(OmegaConf.create(config))
     except (InputError, OmegaConfBaseException) as error:
         raise InputError(f"{folder / RESOLVED}: {one_line(error)}") from None
+    overrides = overrides_of(folder)
     try:
-        now, notes = translated(overrides_of(folder))
+        OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
         raise InputError(f"{folder / OVERRIDES} cannot be read ({one_line(error)})") from None
-    config = with_targets_of_now(_moved(config, job.output_dir, str(output)))
+    config = _moved(config, job.output_dir, str(output))
     if not trust:
         refuse_untrusted(needing_trust(config, output), folder)
+    info = info_of(folder)
+    _check_classes(config, folder, info)
     return RecordedRun(
         folder,
         config,
-        tuple(now),
-        tuple(notes),
+        tuple(overrides),
         job.choices,
         job.sources,
-        info_of(folder),
+        info,
         output,
         trust,
     )
+
+
+def _check_classes(config: Any, folder: Path, info: Mapping[str, Any]) -> None:
+    """Refuse a run whose classes of dolens are not in this version of it."""
+    for path, value, _ in walk("", config):
+        if not path.endswith("_target_") or not str(value).startswith("dolens."):
+            continue
+        try:
+            located(Target(path.removesuffix("._target_"), value, ()))
+        except InputError:
+            commit = (info.get("git") or {}).get("commit") or "unknown"
+            raise InputError(
+                f"{folder}: this version of dolens has no {value}; the run was made by commit "
+                f"{commit}, which can read and repeat it"
+            ) from None
 
 
 def _check_folder(folder: Path) -> None:

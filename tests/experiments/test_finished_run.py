@@ -97,10 +97,13 @@ def test_a_run_keeps_its_own_settings_where_files_say_something_else_now(copy):
     assert load_run(copy, overrides=["light=50"]).cfg.network.noise_to_signal == [0.25, 7.0, 20.0]
 
 
-def test_classes_of_the_former_package_are_found(copy):
+def test_a_class_that_is_gone_names_the_commit_that_has_it(copy):
     file = copy / ".hydra/resolved.yaml"
-    file.write_text(file.read_text().replace("dolens.experiments.", "experiments."))
-    assert load_run(copy).step == 2
+    moved = "dolens.experiments.cameras_of_before."
+    file.write_text(file.read_text().replace("dolens.experiments.camera.", moved))
+    commit = json.loads((copy / "run.json").read_text())["git"]["commit"]
+    assert f"has no {moved}" in refusal(copy, trust=True)
+    assert f"the run was made by commit {commit}" in refusal(copy, trust=True)
 
 
 def test_what_is_no_run_is_refused_in_one_line(copy, tmp_path):
