@@ -1,32 +1,16 @@
-"""The processors that this process may use, the number of its threads, and how they wait.
+"""The processors that this process may use, and the number and the waiting of its threads.
 
 A container may be given two of a machine's 64 processors; PyTorch would start a thread on each of
 its cores.  Only the program `dolens` limits their number, in its own environment and before
 PyTorch starts; a program of a user's that imports dolens keeps what it has.  Nothing here imports
-PyTorch with the module.
-
-Threads wait for each other without sleeping only while no other work needs their processors.
-
-PyTorch's threads belong to OpenMP.  Between two operations they look some milliseconds long whether
-there is more to do (they spin), which saves a fifth of a short step.  Where other programs want the
-same processors, the thread that is waited for may be one that cannot run, and a step takes a
-multiple of its time.
-
-GNU's OpenMP does not spin while a process has more of its threads than there are processors, and
-looks at their number at every wait.  So a process that waits for processors gets some threads more,
-which sleep, until its processors are its own again.  The threads that compute stay as they are, and
-their results do too.
+PyTorch.
 """
 
-import ctypes
-import logging
 import os
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 
 def processors() -> int:
@@ -158,148 +142,3 @@ def limit_threads() -> None:
         allowed = allowed_processors()
         if allowed < processors():  # PyTorch keeps to the affinity mask by itself
             os.environ["OMP_NUM_THREADS"] = str(allowed)
-
-
-logger = logging.getLogger(__name__)
-
-# GNU's OpenMP looks so often (its default), and with too many threads not at all.  Others know the
-# first word alone, and have threads sleep at once.
-POLICY = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "300000"}
-# Where nobody tells how long threads wait for processors: some 20 µs.
-_FIXED_POLICY = POLICY | {"GOMP_SPINCOUNT": "1000"}
-_OF_USERS = (*POLICY, "KMP_BLOCKTIME", "KMP_LIBRARY")
-
-_NAME = "dolens spinning"
-# Looking takes no more than this part of the time (some 9 µs for each thread of the process).
-_LAP_S, _COST = 0.5, 5e-4
-# Beside one busy program on two processors, threads wait for a third of the time in which they
-# could run.  Alone they wait for one or two percent where they spin, and for up to an eighth where
-# they sleep, since they wait to be woken.
-_PRESSED, _FREE = 0.1, 0.15
-# Laps that say no more than this many seconds were run or waited for, say nothing.
-_LEAST_S = 0.05
-# Laps before sleeping threads try to spin.  A try beside other work may cost a lap or two of time:
-# where it ends at once, the next one comes after twice as many.  A free lap counts for several.
-_SHORTEST, _LONGEST, _WORTH = 4, 128, 8
-# Few threads on many processors, as by the quota of a container, need one for each of the others.
-# OpenMP ends the process where the system refuses a thread.
-_MOST_SLEEPING = 256
-
-
-def choose_waiting() -> None:
-    """Set how threads wait in this process, and in those that it starts; a user's choice stays.
-
-    This must come before PyTorch is imported.
-    """
-    if "torch" not in sys.modules and not any(name in os.environ for name in _OF_USERS):
-        os.environ.update(_FIXED_POLICY if ThreadClock().lap() is None else POLICY)
-    follow_other_work()
-
-
-def follow_other_work() -> None:
-    """Have a thread watch this process, where the policy is this module's and threads are many."""
-    ours = all(os.environ.get(name) == value for name, value in POLICY.items())
-    watched = any(thread.name == _NAME for thread in threading.enumerate())
-    if ours and not watched and os.environ.get("OMP_NUM_THREADS") != "1":
-        threading.Thread(target=_follow, name=_NAME, daemon=True).start()
-
-
-class Clock(Protocol):
-    """Tells how long threads ran and waited since it was asked last."""
-
-    def lap(self) -> ThreadTimes | None:
-        """Return the times."""
-
-
-class Team(Protocol):
-    """Threads that sleep."""
-
-    def end(self) -> None:
-        """End them."""
-
-
-class SpinControl:
-    """Decides from lap to lap whether threads may spin.
-
-    Args:
-        clock: of this process.
-        sleeping_team: starts threads that keep all others from spinning until they end.
-    """
-
-    def __init__(self, clock: Clock, sleeping_team: Callable[[], Team]) -> None:
-        self._clock, self._sleeping_team = clock, sleeping_team
-        self._team: Team | None = None
-        self._laps, self._patience = _SHORTEST, _SHORTEST
-
-    @property
-    def spins(self) -> bool:
-        """Whether threads may spin."""
-        return self._team is None
-
-    def look(self) -> None:
-        """Take the times of another lap, and decide."""
-        times = self._clock.lap()
-        if times is None or times.ran + times.waited < _LEAST_S:
-            return
-        if self._team is None:
-            self._laps += 1
-            if times.share_waited >= _PRESSED:
-                failed = self._laps < _SHORTEST
-                self._patience = min(2 * self._patience, _LONGEST) if failed else _SHORTEST
-                self._team, self._laps = self._sleeping_team(), 0
-                logger.debug("threads sleep: %.0f %% waited", 100.0 * times.share_waited)
-            return
-        self._laps += _WORTH if times.share_waited < _FREE else 1
-        if self._laps >= self._patience:
-            self._team.end()
-            self._team, self._laps = None, 0
-            logger.debug("threads spin: %.0f %% waited", 100.0 * times.share_waited)
-
-
-class SleepingTeam:
-    """A team of OpenMP's that has nothing to do.
-
-    Args:
-        openmp: of GNU.
-        torch_threads: says how many threads torch has.
-    """
-
-    def __init__(self, openmp: ctypes.CDLL, torch_threads: Callable[[], int]) -> None:
-        self._openmp, self._torch_threads = openmp, torch_threads
-        self._over = threading.Event()
-        # A team belongs to the thread that first calls for it, and ends with it.
-        self._thread = threading.Thread(target=self._hold, daemon=True)
-        self._thread.start()
-
-    def _hold(self) -> None:
-        # Torch tells its number to a thread that is new.  This thread is not one of those counted.
-        threads = max(0, processors() - self._torch_threads()) + 2
-        if threads <= _MOST_SLEEPING:
-            # A function that takes nothing, and does nothing.
-            nothing = ctypes.cast(self._openmp.omp_get_thread_num, ctypes.c_void_p)
-            self._openmp.GOMP_parallel(nothing, None, threads, 0)
-        self._over.wait()
-
-    def end(self) -> None:
-        """Let the threads go."""
-        self._over.set()
-        self._thread.join()
-
-
-def _follow() -> None:
-    while "torch" not in sys.modules:
-        time.sleep(_LAP_S)
-    import torch
-
-    from dolens.openmp import torchs_openmp
-
-    openmp = torchs_openmp()
-    if openmp is None or hasattr(openmp, "kmp_set_blocktime"):  # of Intel or LLVM: they sleep
-        return
-    control = SpinControl(ThreadClock(), lambda: SleepingTeam(openmp, torch.get_num_threads))
-    lap = _LAP_S
-    while True:
-        time.sleep(lap)
-        began = time.thread_time()
-        control.look()
-        lap = max(_LAP_S, (time.thread_time() - began) / _COST)

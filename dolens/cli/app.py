@@ -22,7 +22,7 @@ from dolens.cli.show import show
 from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError, one_line
 from dolens.files import installed_version
-from dolens.threads import choose_waiting, limit_threads
+from dolens.threads import limit_threads
 
 app = typer.Typer(
     name="dolens",
@@ -37,7 +37,6 @@ def main() -> None:
 
     A file that the system refuses to open, name or write is such a mistake too.
     """
-    choose_waiting()
     for stream in (sys.stdout, sys.stderr):
         # Names of files may hold what no terminal shows.
         if isinstance(stream, io.TextIOWrapper):

@@ -13,7 +13,6 @@ from typer.core import TyperCommand
 
 from dolens.cli.extras import import_extra
 from dolens.errors import InputError
-from dolens.threads import choose_waiting
 
 
 class PassedOn(TyperCommand):
@@ -53,7 +52,6 @@ def run_training(arguments: Sequence[str], program: str) -> None:
         return
     if {"-sc", "--shell-completion"} & set(arguments) and not program.endswith(".py"):
         sys.exit("error: dolens --install-completion installs the completion of this command")
-    choose_waiting()
     try:
         main = import_extra("dolens.experiments.running.main", "train", "dolens train").main
     except InputError as error:

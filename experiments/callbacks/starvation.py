@@ -49,7 +49,8 @@ class StarvationWarning(lightning.Callback):
         logger.warning(
             "This run is starved: in %.0f s its threads (%d) had a processor for %.0f s and waited "
             "for one for %.0f s (%.0f %%; load %.1f, %d processors). Other work takes the rest, "
-            "data.num_workers too: run fewer jobs at once, or give each threads=1",
+            "data.num_workers too: run fewer jobs at once, give each threads=1, or set "
+            "OMP_WAIT_POLICY=passive",
             window,
             torch.get_num_threads(),
             times.ran,

@@ -124,3 +124,8 @@ def test_threads_keep_to_a_quota_unless_the_user_says_otherwise(clean):
     del os.environ["MKL_NUM_THREADS"]
     threads.limit_threads()
     assert os.environ["OMP_NUM_THREADS"] == "2"
+
+
+def test_a_library_import_changes_no_setting_of_the_process(root):
+    program = "import os; a = dict(os.environ); import dolens; assert a == dict(os.environ)"
+    subprocess.run([sys.executable, "-c", program], cwd=root, check=True, timeout=120)
