@@ -33,7 +33,6 @@ from dolens.experiments.running.run_files import (
     read_yaml,
 )
 from dolens.prescriptions.yaml_text import plain_values
-from dolens.threads import follow_other_work
 
 logger = logging.getLogger(__name__)
 
@@ -151,7 +150,6 @@ class Elsewhere:
 
     def __call__(self) -> JobReturn:
         """Give the process what it needs to know, and run the job."""
-        follow_other_work()
         setup_globals()
         Singleton.set_state(self.job.singletons)
         sys.argv = list(self.job.arguments)
