@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from dolens.errors import InputError
+from dolens.optics import LENS_METHODS
 
 if TYPE_CHECKING:
     from dolens.optics.lens import Lens
@@ -25,6 +26,12 @@ _HOMES = {
     "save_lens": "dolens.prescriptions",
 }
 _PACKAGES = ("kernels", "optics", "prescriptions")
+_VIEWS = (
+    *("draw", "encircled_energy", "field_curves", "footprint", "lateral_colour", "mtf", "psf"),
+    *("ray_fans", "relative_illumination", "rms", "spots", "strehl", "summary", "wavefront"),
+    "zernike",
+)
+LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))
 
 
 def __getattr__(name: str) -> Any:

@@ -38,6 +38,7 @@ ALLOWED = {
     },
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
+    "views": {"errors", "optics", "analysis", "diffraction", "plotting"},
     # A page about a lens shows what all of these find out.
     "lens_page": {
         *("errors", "files", "html", "optics", "prescriptions", "analysis", "diffraction"),
@@ -53,12 +54,6 @@ ALLOWED = {
 # The command line stands above everything, the experiments too.
 ALLOWED["cli"] = {*ALLOWED, "experiments"}
 ALLOWED["__main__"] = {"cli"}
-
-# A lens's methods for notebooks are one-line ways to what the floors above compute and draw.  This
-# one folder may import them, inside functions only: tracing and training need none of them.
-VIEWS = ROOT / "dolens" / "optics" / "lens_views"
-VIEWS_MAY_CALL = {"analysis", "diffraction", "plotting"}
-
 
 # What executes what a file holds.
 EXECUTING = {
@@ -98,8 +93,7 @@ def test_imports_of_the_library(path):
         assert top not in {"hydra", "omegaconf", "lightning", "pytorch_lightning", "experiments"}
         if top == "dolens" and part != "__init__":
             assert rest, "import from the part, not from the whole"
-            above = VIEWS_MAY_CALL if path.parent == VIEWS else set()
-            assert rest[0] in ALLOWED[part] | {part} | above, module
+            assert rest[0] in ALLOWED[part] | {part}, module
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)

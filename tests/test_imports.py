@@ -1,7 +1,15 @@
 """Nothing is imported before it is needed: seconds of every start, and compilers that may fail."""
 
+import copy
+import pickle
 import subprocess
 import sys
+
+import pytest
+
+from dolens import load_lens
+from dolens.optics import LENS_METHODS
+from dolens.views import LensViews
 
 # In this order: each part imports what the one before must not.
 PROGRAM = """
@@ -10,10 +18,9 @@ import sys
 def loaded(*names):
     return [m for m in sys.modules for name in names if m == name or m.startswith(name + ".")]
 
-# The views of a lens import the floors above when they are called.
+# What shows a lens is imported when it is called.
 import dolens.optics.lens
-assert loaded("dolens.optics.lens_views")
-above = loaded("dolens.analysis", "dolens.diffraction", "dolens.plotting")
+above = loaded("dolens.views", "dolens.analysis", "dolens.diffraction", "dolens.plotting")
 assert not above, above
 
 # A few rays and a drawing need no compiler, and rays no SymPy, which some functions of PyTorch
@@ -41,3 +48,14 @@ def test_each_part_imports_no_more_than_it_needs(root):
         [sys.executable, "-c", PROGRAM], cwd=root, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_lens_has_the_methods_that_show_it_wherever_it_comes_from():
+    lens = load_lens("cooke_triplet")
+    for each in (lens, copy.deepcopy(lens), pickle.loads(pickle.dumps(lens))):
+        assert {"spots", "mtf", "summary", "trace", "surfaces"} <= set(dir(each))
+        assert each.summary.__self__ is each and each.summary.__func__ is LensViews.summary
+    methods = {name for name in dir(LensViews) if not name.startswith("_")}
+    assert methods == set(LENS_METHODS)
+    with pytest.raises(AttributeError, match="no attribute 'spotz'"):
+        lens.spotz()

@@ -3,12 +3,15 @@
 import difflib
 import fnmatch
 from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from pkgutil import resolve_name
+from types import MethodType
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics import LENS_METHODS
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
@@ -16,10 +19,10 @@ from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
-from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import MIRROR, Medium, media_of
 from dolens.optics.paraxial import vergence
 from dolens.optics.paraxial_rays import ideal_lenses, reversals, with_vergences
+from dolens.optics.prescription_table import PrescriptionTable, prescription_table
 from dolens.optics.ray_tracing import check_backend, is_few, trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -107,7 +110,7 @@ class Published(NamedTuple):
     note: str | None = None
 
 
-class Lens(LensRays, LensViews, InStates, nn.Module):
+class Lens(LensRays, InStates, nn.Module):
     """Surfaces, gaps, media and a sensor, plane or curved.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
@@ -228,6 +231,28 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
     def device(self) -> torch.device:  # type: ignore[override]
         """The device that the parameters live on."""
         return self.sensor_distance.device
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a parameter or part, or a method that a higher part of the library has."""
+        if name in LENS_METHODS:
+            return MethodType(getattr(resolve_name(LENS_METHODS[name]), name), self)
+        return super().__getattr__(name)
+
+    def __dir__(self) -> list[str]:
+        """Return all names, those of `LENS_METHODS` too."""
+        return sorted({*super().__dir__(), *LENS_METHODS})
+
+    def __repr__(self) -> str:
+        """Return the prescription as a table."""
+        return self.prescription().text()
+
+    def _repr_html_(self) -> str:
+        """Return the prescription as a table for a notebook; all text is escaped."""
+        return self.prescription().html()
+
+    def prescription(self) -> PrescriptionTable:
+        """Return the prescription in the lens's present state as plain values."""
+        return prescription_table(self)
 
     @property
     def primary_wavelength(self) -> float:

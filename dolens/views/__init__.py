@@ -1,17 +1,17 @@
 """What a lens shows of itself, in a notebook above all.
 
-The methods stand on the floors above: analysis, diffraction, plotting.  They are imported when a
-method is called, so that a lens can be traced and trained without them.  Every method takes the
-lens's own fields, wavelengths and object distance unless others are given (see
+The methods call analysis, diffraction and plotting.  `Lens` finds them by `LENS_METHODS` of
+`dolens.optics` when one is called, so that a lens is traced and trained without them.  Every method
+takes the lens's own fields, wavelengths and object distance unless others are given (see
 `dolens.analysis.conditions` for the defaults of a lens that names none), and returns a figure that
 belongs to nobody else: pyplot does not know it.
 
 The numbers behind each figure come from the functions that the methods call.
 """
 
-from dolens.optics.lens_views.image_quality import ImagePointViews, OverFieldViews
-from dolens.optics.lens_views.overview import OverviewViews
-from dolens.optics.lens_views.wavefronts import WavefrontViews
+from dolens.views.image_quality import ImagePointViews, OverFieldViews
+from dolens.views.overview import OverviewViews
+from dolens.views.wavefronts import WavefrontViews
 
 
 class LensViews(OverviewViews, ImagePointViews, OverFieldViews, WavefrontViews):

@@ -1,4 +1,4 @@
-"""A lens shows its prescription, numbers and section, at conditions that all views share."""
+"""A lens shows its numbers and its section, at conditions that all views share."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
-
-from dolens.optics.prescription_table import PrescriptionTable, prescription_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,19 +17,7 @@ if TYPE_CHECKING:
 
 
 class OverviewViews:
-    """Methods of `Lens` that show what it is; see `LensViews` for their arguments."""
-
-    def __repr__(self) -> str:
-        """Return the prescription as a table."""
-        return self.prescription().text()
-
-    def _repr_html_(self) -> str:
-        """Return the prescription as a table for a notebook; all text is escaped."""
-        return self.prescription().html()
-
-    def prescription(self) -> PrescriptionTable:
-        """Return the prescription in the lens's present state as plain values."""
-        return prescription_table(self)
+    """Methods of `Lens` that show it as a whole; see `LensViews` for their arguments."""
 
     def summary(
         self,

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.lens_views.overview import as_lens, looked_at, shown, title_of
+from dolens.views.overview import as_lens, looked_at, shown, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolens.analysis.conditions import FieldPoints
-    from dolens.optics.lens_views.overview import Wavelengths
+    from dolens.views.overview import Wavelengths
 
 KINDS = ("fourier", "huygens")
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dolens.optics.lens_views.overview import as_lens, looked_at, shown, title_of
+from dolens.views.overview import as_lens, looked_at, shown, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolens.analysis.conditions import FieldPoints
-    from dolens.optics.lens_views.overview import Wavelengths
+    from dolens.views.overview import Wavelengths
 
 
 class WavefrontViews:
