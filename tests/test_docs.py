@@ -14,14 +14,18 @@ from hydra.core.global_hydra import GlobalHydra
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SUPPLEMENT = (ROOT / "docs/supplement.md").read_text(encoding="utf-8")
+SOURCES = sorted(p for top in ("dolens", "experiments") for p in (ROOT / top).rglob("*.py"))
+# Parts of the library, but for those whose names are also groups of the configuration.
+PARTS = {p.name for p in (ROOT / "dolens").iterdir() if (p / "__init__.py").exists()}
+PARTS -= {p.name for p in (ROOT / "conf").iterdir()}
 NAMES = sorted(
     {
         name
-        for document in DOCUMENTS
+        for source in (*DOCUMENTS, *SOURCES)
         for name in re.findall(
-            r"`((?:dolens|experiments|torch)(?:\.\w+)+)`", document.read_text(encoding="utf-8")
+            rf"`((?:dolens|torch|{'|'.join(PARTS)})(?:\.\w+)+)`", source.read_text(encoding="utf-8")
         )
-        if not name.endswith((".py", ".txt"))
+        if not name.endswith((".py", ".txt", ".html"))
     }
 )
 COMMANDS = sorted(set(re.findall(r"`(experiment=[^`]+)`", SUPPLEMENT)))
@@ -59,8 +63,9 @@ def resolved(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dotted_name_of_the_documents_is_in_the_code(name):
-    resolved(name)
+def test_a_dotted_name_of_documents_and_docstrings_is_in_the_code(name):
+    own = name.partition(".")[0] in PARTS
+    resolved(f"dolens.{name}" if own else name)
 
 
 @pytest.fixture(scope="module")

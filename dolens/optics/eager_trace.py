@@ -161,7 +161,7 @@ class Prepared(NamedTuple):
 
     Attributes:
         kernels: the module of the CPU's.
-        numbers: how records are made of numbers; see `kernels.cpu.stored_numbers`.
+        numbers: how records are made of numbers; see `kernels.cpu.backend`.
         frames: of the kernels' programs.
     """
 

@@ -85,8 +85,8 @@ class ImagePointViews:
     ) -> Figure:
         """Plot the MTF with diffraction and of rays, of all wavelengths together.
 
-        See `diffraction.transfer.diffraction_modulation`,
-        `diffraction.huygens_transfer.huygens_modulation` and
+        See `diffraction.modulation_transfer.diffraction_modulation`,
+        `diffraction.huygens.huygens_modulation` and
         `analysis.modulation_transfer.modulation`.
 
         Args:
@@ -262,7 +262,7 @@ class OverFieldViews:
     ) -> Figure:
         """Plot RMS spot radii over the field, and over the wavelength for some fields.
 
-        See `analysis.rms_curves`.
+        See `analysis.spot_diagram`.
 
         Args:
             edge: of the field, as in `field_curves`.

@@ -80,7 +80,7 @@ class WavefrontViews:
         count: int = 7,
         **aperture: float,
     ) -> Figure:
-        """Plot Strehl ratios over the field; see `diffraction.strehl.strehl_ratios`.
+        """Plot Strehl ratios over the field; see `diffraction.point_spread.strehl_ratios`.
 
         Args:
             edge: of the field, as in `field_curves`.

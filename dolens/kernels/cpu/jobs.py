@@ -23,7 +23,7 @@ TARGET, TARGET_ROW, TARGET_COLUMN, WEIGHT, WEIGHT_ROW, GROUP, GROUPS = range(55,
 ENTRY_FIRST = 62
 # The wavelength's column of all rays of the block at hand, plus one; zero where they differ.
 WAVELENGTH = 63
-# Of a renderer: arrays of integers and of numbers; see `rendering.layout`.
+# Of a renderer: arrays of integers and of numbers; see `kernels.cpu.rendering.layout`.
 VIEW, LENGTHS = range(64, 66)
 # Variables that indices depend on: how many; row of `indices` and column of each; and their
 # derivatives, a row of wavelengths for each.
