@@ -30,7 +30,7 @@ from dolens.sensor.readout import Readout
 
 READOUTS = ("each", "one")
 KNOWLEDGE = ("known", "estimated", "ignored")
-# Streams of random numbers beside those of `dolens.experiments.camera.views.base`: a readout's own, and of motion.
+# Streams of random numbers beside those of the views: a readout's own, and of motion.
 _READOUT_OFFSET, _MOTION_OFFSET = 1 << 34, 1 << 37
 # Textures move by so many pixels at most; their margins are wider.
 _MOST_MOTION = 8.0
