@@ -27,7 +27,16 @@ _HOMES = {
 }
 _PACKAGES = ("kernels", "optics", "prescriptions")
 _VIEWS = (
-    *("draw", "encircled_energy", "field_curves", "footprint", "lateral_colour", "mtf", "psf"),
+    *(
+        "draw",
+        "encircled_energy",
+        "explain",
+        "field_curves",
+        "footprint",
+        "lateral_colour",
+        "mtf",
+        "psf",
+    ),
     *("ray_fans", "relative_illumination", "rms", "spots", "strehl", "summary", "wavefront"),
     "zernike",
 )

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolens.analysis.conditions import Conditions, FieldPoints
+    from dolens.analysis.ray_path import RayPath
     from dolens.analysis.summary import LensSummary
     from dolens.optics.lens import Lens
+    from dolens.optics.rays import Rays
 
 
 class OverviewViews:
@@ -32,6 +34,15 @@ class OverviewViews:
         lens, given = looked_at(self.summary, fields, wavelengths, object_distance, aperture)
         distance = float("inf") if given.object_distance is None else given.object_distance
         return lens_summary(lens, given.fields, given.wavelengths, distance)
+
+    def explain(self, rays: Rays) -> RayPath:
+        """Follow one ray surface by surface, and say why it ends where it does.
+
+        See `analysis.ray_path.ray_path`; `lens.chief_ray(field)` is such a ray.
+        """
+        from dolens.analysis.ray_path import ray_path
+
+        return ray_path(as_lens(self), rays)
 
     def draw(
         self,
