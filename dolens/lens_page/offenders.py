@@ -20,11 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import Conditions
-from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError, check_keys
 from dolens.lens_page.tables import Table, number
 from dolens.optics.lens import Lens
@@ -37,10 +35,8 @@ from dolens.tolerancing import (
     Sensitivities,
     Tolerances,
     contributions,
-    fields_all_around,
-    linear_spots,
+    linear_spots_over_field,
     sensitivities,
-    spot_weights,
     tolerances_from,
     usual_tolerances,
     usual_tolerances_text,
@@ -48,7 +44,6 @@ from dolens.tolerancing import (
 )
 
 DEFAULT = "default"
-_RINGS, _ARMS = 3, 8
 _MOST = 12
 # `drawing` is what `dolens export` writes on drawings besides.
 _OWN_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
@@ -141,20 +136,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         lens = copy.deepcopy(lens).requires_grad_(True)
         given, factor = _read(lens, Path(source), notes)
     tolerances = tolerances_from(lens, given, factor)
-    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
-    counts = where.weights > 0.0
-    spots = gaussian_quadrature(
-        lens,
-        list(fields),
-        where.wavelengths[counts].tolist(),
-        _RINGS,
-        _ARMS,
-        where.object_distance,
-        symmetry=False,
-    )
-    model = linear_spots(lens, spots, tolerances.names)
-    of_fields = where.weights.new_tensor(list(fields.values()))
-    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
+    model, weights = linear_spots_over_field(lens, where, tolerances.names)
     return Offenders(
         tolerances,
         sensitivities(model, tolerances.steps, weights),

@@ -14,7 +14,6 @@ import torch
 
 from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.lateral_colour import lateral_colour
-from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
 from dolens.files import written_whole
 from dolens.lens_search.forms import FoundLens
@@ -32,10 +31,8 @@ from dolens.prescriptions.lens_formats import FORMATS
 from dolens.tolerancing import (
     Yield,
     contributions,
-    fields_all_around,
-    linear_spots,
+    linear_spots_over_field,
     quantiles,
-    spot_weights,
     tolerances_from,
     usual_tolerances,
     usual_tolerances_text,
@@ -147,8 +144,7 @@ def lens_colour(lens: Lens) -> LensColour | None:
     return LensColour(red - blue, 0.5 * (red + blue) - middle, float(lateral))
 
 
-# Rings and arms of the rays of a spot; lenses that are drawn, by a generator with this seed.
-_RINGS, _ARMS = 3, 8
+# Lenses that are drawn, by a generator with this seed.
 _LENSES, _SEED = 500, 24
 _SHARE = 0.9
 
@@ -190,15 +186,7 @@ def lens_sensitivity(lens: Lens) -> LensSensitivity:
     where = conditions(lens)
     made = with_glass_elements(lens)
     tolerances = tolerances_from(made, usual_tolerances(made))
-    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
-    counts = where.weights > 0.0
-    waves = where.wavelengths[counts].tolist()
-    spots = gaussian_quadrature(
-        made, list(fields), waves, _RINGS, _ARMS, where.object_distance, symmetry=False
-    )
-    of_fields = where.weights.new_tensor(list(fields.values()))
-    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
-    model = linear_spots(made, spots, tolerances.names)
+    model, weights = linear_spots_over_field(made, where, tolerances.names)
     adding = contributions(model, tolerances, weights)
     errors = tolerances.draw(_LENSES, torch.Generator().manual_seed(_SEED))
     curves = model.focus_curves(errors)

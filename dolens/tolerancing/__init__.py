@@ -17,6 +17,7 @@ from dolens.tolerancing.sensitivity import (
     Sensitivities,
     contributions,
     linear_spots,
+    linear_spots_over_field,
     sensitivities,
     spot_weights,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "expected_spread",
     "fields_all_around",
     "linear_spots",
+    "linear_spots_over_field",
     "quantiles",
     "scaled_tolerances",
     "sensitivities",

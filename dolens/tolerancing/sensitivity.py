@@ -9,12 +9,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optics.system import require_plane_sensor
-from dolens.tolerancing.tolerances import Tolerances
+from dolens.tolerancing.tolerances import Tolerances, fields_all_around
+
+# Rays of a spot over the field: rings of Gaussian quadrature, and arms.
+_RINGS, _ARMS = 3, 8
 
 
 @dataclass(frozen=True)
@@ -166,6 +170,35 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
         )
         forms.append(torch.stack([a.T @ b for a, b in pairs]))
     return LinearSpots(tuple(names), means[..., 0, 0], means[..., 1:, 0], *forms)
+
+
+def linear_spots_over_field(
+    lens: Lens, where: Conditions, names: Sequence[str]
+) -> tuple[LinearSpots, Tensor]:
+    """Return spots over the whole field as a linear function of parameters, and their weights.
+
+    Fields are taken on all sides of the axis: a lens with tilted elements has no symmetry.
+
+    Args:
+        lens: as designed.
+        where: fields and wavelengths with their weights.
+        names: of P parameters.
+
+    Returns:
+        The model, and the weight of each spot, as `spot_weights` has them.
+
+    Raises:
+        InputError: no light of a field passes.
+    """
+    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
+    counts = where.weights > 0.0
+    waves = where.wavelengths[counts].tolist()
+    spots = gaussian_quadrature(
+        lens, list(fields), waves, _RINGS, _ARMS, where.object_distance, symmetry=False
+    )
+    of_fields = where.weights.new_tensor(list(fields.values()))
+    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
+    return linear_spots(lens, spots, names), weights
 
 
 def _points(lens: Lens, spots: SpotRays, names: Sequence[str]) -> Tensor:

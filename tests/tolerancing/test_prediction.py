@@ -8,8 +8,8 @@ import torch
 from dolens.tolerancing import (
     Outcome,
     contributions,
+    linear_spots,
     scaled_tolerances,
-    sensitivity,
     spot_weights,
     tolerances_from,
     trace_perturbed,
@@ -20,7 +20,7 @@ def outcomes(triplet, spots, tolerances, count, seed=0):
     weights = spot_weights(None, spots.count)
     errors = tolerances.draw(count, torch.Generator().manual_seed(seed))
     traced = trace_perturbed(triplet, spots, tolerances.names, errors).curves
-    linear = sensitivity(triplet, spots, tolerances.names).focus_curves(errors)
+    linear = linear_spots(triplet, spots, tolerances.names).focus_curves(errors)
     return Outcome.of(traced, weights), Outcome.of(linear, weights)
 
 
@@ -46,7 +46,7 @@ def test_without_errors_the_prediction_is_exact(triplet, spots, settings):
 def test_average_rise_and_spread_are_those_of_drawn_lenses(triplet, spots, settings):
     """Within four standard errors of 4000 lenses; every tolerance alone, and all together."""
     tolerances, weights = tolerances_from(triplet, settings), spot_weights(None, spots.count)
-    model = sensitivity(triplet, spots, tolerances.names)
+    model = linear_spots(triplet, spots, tolerances.names)
     count = 4000
     errors = tolerances.draw(count, torch.Generator().manual_seed(7))
     for refocused in (False, True):
@@ -76,7 +76,7 @@ def test_average_rise_and_spread_are_those_of_drawn_lenses(triplet, spots, setti
 
 def test_a_focus_error_costs_nothing_where_it_is_compensated(triplet, spots):
     tolerances = tolerances_from(triplet, {"sensor_distance": 0.1, "thicknesses.2": 0.02})
-    model = sensitivity(triplet, spots, tolerances.names)
+    model = linear_spots(triplet, spots, tolerances.names)
     column = tolerances.names.index("sensor_distance")
     weights = spot_weights(None, spots.count)
     fixed, free = (contributions(model, tolerances, weights, r) for r in (False, True))

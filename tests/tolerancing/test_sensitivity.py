@@ -8,7 +8,7 @@ import torch
 from dolens import InputError
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.prescriptions import lens_from_prescription
-from dolens.tolerancing import sensitivities, sensitivity, spot_weights
+from dolens.tolerancing import linear_spots, sensitivities, spot_weights
 
 NAMES = (
     "elements.front.tilt_x",
@@ -25,7 +25,7 @@ NAMES = (
 def test_derivatives_equal_central_differences_of_traced_lenses(
     triplet, spots, moved, traced_spots
 ):
-    model = sensitivity(triplet, spots, NAMES)
+    model = linear_spots(triplet, spots, NAMES)
     step = 1e-5
     for column, name in enumerate(NAMES):
         h = 0.01 * step if name.endswith("curvature") else step
@@ -50,7 +50,7 @@ def test_a_lens_that_is_off_already_has_derivatives_where_it_stands(
 ):
     tilted = moved(triplet, {"elements.middle.tilt_x": math.radians(0.4)})
     name, h = "elements.middle.tilt_x", 1e-5
-    model = sensitivity(tilted, spots, [name])
+    model = linear_spots(tilted, spots, [name])
     radii = [traced_spots(moved(tilted, {name: sign * h}), spots)[1] for sign in (1, -1)]
     torch.testing.assert_close(
         model.rms_jacobian[:, 0], (radii[0] - radii[1]) / (2 * h), rtol=1e-5, atol=1e-7
@@ -97,7 +97,7 @@ def motion(thin_pair):
     spots = gaussian_quadrature(thin_pair, [(0.0, 0.0)], [587.5618], 2, 4, symmetry=False)
 
     def by(name):
-        return sensitivity(thin_pair, spots, [name]).centroid_jacobian[0, :, 0].tolist()
+        return linear_spots(thin_pair, spots, [name]).centroid_jacobian[0, :, 0].tolist()
 
     return by
 
@@ -134,7 +134,7 @@ def test_what_a_whole_tolerance_does_where_the_derivative_says_nothing(
     spots = gaussian_quadrature(triplet, [(0.0, 0.0)], [587.5618], 4, 12, symmetry=False)
     name, step = "elements.middle.decenter_y", 0.1
     found = sensitivities(
-        sensitivity(triplet, spots, [name]), torch.tensor([step]).double(), spot_weights(None, 1)
+        linear_spots(triplet, spots, [name]), torch.tensor([step]).double(), spot_weights(None, 1)
     )
     assert abs(float(found.rms_jacobian)) < 1e-9
     exact = float(traced_spots(moved(triplet, {name: step}), spots)[1])
@@ -145,7 +145,7 @@ def test_what_a_whole_tolerance_does_where_the_derivative_says_nothing(
 
 
 def test_refocusing_never_makes_a_lens_worse(triplet, spots):
-    model = sensitivity(triplet, spots, NAMES)
+    model = linear_spots(triplet, spots, NAMES)
     steps = torch.full((len(NAMES),), 1e-4, dtype=torch.float64)
     weights = spot_weights(None, spots.count)
     found = sensitivities(model, steps, weights)
@@ -161,7 +161,7 @@ def test_rays_of_half_a_pupil_are_refused(triplet_without_elements):
     lens = triplet_without_elements
     spots = gaussian_quadrature(lens, [(0.0, 10.0)], [587.5618])
     with pytest.raises(InputError, match="symmetry=False"):
-        sensitivity(lens, spots, ["thicknesses.1"])
+        linear_spots(lens, spots, ["thicknesses.1"])
 
 
 @pytest.fixture
