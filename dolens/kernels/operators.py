@@ -2,7 +2,6 @@
 
 `dolens::trace` and `dolens::trace_adjoint` take a packed table as tensors, so that graphs and saved
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
-
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -4,7 +4,6 @@ A view is a sensor's pixels, their samples of the pupil, and planes of a scene.
 
 As the trace's, they take the packed table as tensors and know first derivatives only.  What no
 gradient concerns, the view, comes as lists of integers and of numbers.
-
 """
 
 from dataclasses import dataclass

@@ -2,7 +2,6 @@
 
 A surface class carries a `SurfaceKernel`, and a law a `LawKernel`.  Its `code` marks its steps in a
 table, so that the kernels know no list of surfaces: a new one is its own modules.
-
 """
 
 from dataclasses import dataclass, field

@@ -10,7 +10,6 @@ kernel.  Every step has a row of `codes` (integers) and a record in `values` (nu
 fixed slots and then the numbers of its shape.
 
 Positions count from the vertex at hand, along the axes of the surface at hand.
-
 """
 
 from dataclasses import dataclass

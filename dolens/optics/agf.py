@@ -14,7 +14,6 @@ a keyword of two letters and its numbers:
     IT  wavelength (µm), internal transmittance, thickness (mm)
 
 A file is only data: nothing in it is run, and what is wrong in one glass refuses that glass alone.
-
 """
 
 import math

@@ -19,7 +19,6 @@ what keeps it on the branch that starts at the axis.  Behind coordinate breaks t
 space need not lead to the stop: there the branch starts at a ray sent back from the stop.  All of
 it runs outside the autograd graph; one more Newton step inside leaves the value where it is and has
 the implicit function's derivative.
-
 """
 
 import math

@@ -5,7 +5,6 @@ Gradients of a long computation with the memory of a short one (adjoint back-pro
 The forward pass runs piece by piece without a graph.  The backward pass runs each piece again,
 with a graph this time, pushes the output's gradient through it at once and lets it go.  Memory is
 bounded by one piece; the price is one more forward pass.
-
 """
 
 from collections.abc import Callable, Sequence

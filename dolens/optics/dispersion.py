@@ -24,7 +24,6 @@ from this normal line, and that it is accurate to about 1e-4 in the visible (Zem
 themselves they are smaller: the foci that OpticStudio has written into 15 files are met within 1e-6
 of the focal length here, and would be within 2e-8 if nd, nF and nC were those at 587.6, 486.1 and
 656.3 nm.
-
 """
 
 from collections.abc import Callable, Iterable

@@ -6,7 +6,6 @@ thousand rays.
 
 A record is a few sums of numbers; one call of a kernel takes a fifth of the time that PyTorch's
 operations take to begin.  The sums are those of `dolens.optics.packing`, in the same order.
-
 """
 
 from collections.abc import Sequence

@@ -13,7 +13,6 @@ zero where they are not given.
   R being the semi-diameter: the fringe Zernike terms z5 and z6 with the clear aperture as their
   disc.  The surface is out of round by 2·√(a² + b²) from peak to valley.  A test plate shows a
   fringe for each half wavelength of sag, so that one fringe at 546 nm is √(a² + b²) = 0.137 µm.
-
 """
 
 import fnmatch

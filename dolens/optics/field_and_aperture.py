@@ -2,7 +2,6 @@
 
 Object points follow from image heights or pupil angles.  The stop's size follows from an f-number,
 from the diameter of the entrance pupil, or from the real marginal ray.
-
 """
 
 import copy

@@ -8,7 +8,6 @@ The index of air is that of Edlén (Journal of the Optical Society of America 43
 and 1 atm, carried to other temperatures and pressures as Kohlrausch does (Praktische Physik, 1968).
 Schott's dn/dT constants are defined with it (TIE-19), and Zemax uses it.  Ciddor's formula
 (Applied Optics 35 (1996) 1566) of dry air differs by less than 1e-7 from 0 to 40 °C in the visible.
-
 """
 
 import math

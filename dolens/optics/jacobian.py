@@ -4,7 +4,6 @@ The reference, which the kernels must equal, is PyTorch's forward mode.
 
 A ray's sensor point and path length depend on no other ray, so two or three reverse sweeps give all
 columns at once, however many variables there are.
-
 """
 
 from collections.abc import Mapping, Sequence

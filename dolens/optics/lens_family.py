@@ -8,7 +8,6 @@ Lenses of a family are traced some at a time, so that what is found of them stay
 
 Their records are packed once for all: where poses vary, that takes as long for one lens as for a
 thousand.
-
 """
 
 from collections.abc import Iterator, Sequence

@@ -2,7 +2,6 @@
 
 `docs/glass.md` explains the names and the formulas behind them.  A mirror stands in the place of
 the medium behind a surface, and light goes back into the medium that it came from.
-
 """
 
 import math

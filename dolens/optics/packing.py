@@ -4,7 +4,6 @@ A lens's numbers stand in an order that its structure gives.
 
 Every number of the table is a sum of parameters with signs, or comes from the poses, so that
 gradients flow back through ordinary tensor operations, and derivatives by parameters are known.
-
 """
 
 import math

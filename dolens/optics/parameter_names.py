@@ -2,7 +2,6 @@
 
 A lens holds lengths in mm and angles in radians.  Files, configuration and tables hold angles in
 degrees.  A parameter that a state has for itself is named `states.wide.thicknesses.5`.
-
 """
 
 import math

@@ -17,7 +17,6 @@ What lies at infinity (the foci of an afocal lens, the pupil of a telecentric on
 carries a zero gradient, so that one infinite quantity leaves the gradients of the others alone.
 Only a power that is exactly zero counts: a telescope whose power is a rounding error has an EFL of
 1e15 mm or so.  A constraint that must cross zero is better put on `power`.
-
 """
 
 import math

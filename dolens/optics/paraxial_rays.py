@@ -2,7 +2,6 @@
 
 Besides them: the vergence of the axial beam at ideal lenses, and the ray along the axis, which
 tells from which side light comes behind coordinate breaks.
-
 """
 
 from collections.abc import Sequence

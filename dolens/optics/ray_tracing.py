@@ -2,7 +2,6 @@
 
 A backend is an implementation: PyTorch's operations as the reference, or the kernels for CPUs or
 GPUs.
-
 """
 
 import logging

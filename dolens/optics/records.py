@@ -2,7 +2,6 @@
 
 Structure is what stays while a lens is optimised: kinds of surfaces, apertures, media, which
 elements carry what.  So records are laid out once, and packing is then one gather and one sum.
-
 """
 
 from collections.abc import Sequence

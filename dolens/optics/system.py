@@ -6,7 +6,6 @@ keeps the last system made of it while it is made of the same things.
 A system holds the lens's own tensors, so that it stays the lens's whatever their values become; it
 is made anew as soon as anything stands in the place of a tensor, a surface, an aperture or a medium
 that it was made of.
-
 """
 
 import math

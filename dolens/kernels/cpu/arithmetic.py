@@ -6,7 +6,6 @@ A phase deflects rays where they stand on a surface; see `dolens.optics.surfaces
 
 The surface gives the normal by its block functions `sag` and `sag_hessian`, and the phase gives φ,
 its gradient and its second derivatives by its own, all by address in the codes.
-
 """
 
 import math

@@ -4,7 +4,6 @@ Numbers that lie scattered in memory make a table's records by one call.
 
 The parameters of a lens are some ten or hundred tensors of one number.  PyTorch takes longer to
 join these than to trace a thousand rays.
-
 """
 
 from array import array

@@ -3,7 +3,6 @@
 A kernel is a function of pointers, made by a factory: a function of a real type that returns the
 kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.  The
 kernels of a surface or of a law of deflection are block functions, given by their factories.
-
 """
 
 import ctypes

@@ -7,7 +7,6 @@ its branch at the points in two work rows), `sag_hessian` (slopes and second der
 Three functions of one point make a surface's kernels: the simplest way to a fast surface.
 
 The functions are inlined in the loops over a block's rays, which LLVM then vectorises.
-
 """
 
 import math

@@ -10,7 +10,6 @@ kernel was made from; no Python object is in it, and nothing is unpickled, as it
 cache.  The digest finds damage, and files that were exchanged.  Machine code is executed, of
 course, so a file counts only if this user (or root) owns it and nobody else may write to it; what a
 user runs can write such files too, as it can write the user's Python packages.
-
 """
 
 import hashlib

@@ -5,7 +5,6 @@ so that ray i of row X is number `X + i`.  Numba takes integers of a module, and
 class.  It freezes them when it compiles: LLVM sees constant distances between rows, without which
 it would not vectorise.  `compiler.stamp` covers these sources, so that a change here makes the
 kernels on disk stale.
-
 """
 
 from dolens.kernels.table import Code, Failure, Kind, Outline, Slot

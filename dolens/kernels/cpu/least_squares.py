@@ -14,7 +14,6 @@ A step δ minimises 2gᵀδ + δᵀ(H + diag(d))δ with lower ≤ δ ≤ upper. 
 is found by block principal pivoting (Júdice and Pires, Comput. Oper. Res. 21, 587, 1994): guess the
 set, solve for the rest by Cholesky's factors, and exchange every variable that contradicts the
 guess; after some turns only the last one of them (Murty's rule).
-
 """
 
 import math

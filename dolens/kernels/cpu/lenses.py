@@ -8,7 +8,6 @@ The driver of many lenses runs another driver for one lens after the other.
 Lenses of one structure share the codes of their steps, so that they differ in addresses only: those
 of their numbers, of their indices, of their rays and of what is written.  Each moves on by a fixed
 number of bytes from one lens to the next.
-
 """
 
 from collections.abc import Callable, Mapping, Sequence

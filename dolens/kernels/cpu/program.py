@@ -1,7 +1,6 @@
 """A program is a surface table with its compiled steps; drivers run over it.
 
 Drivers of Jacobians and of least squares run over a program of derivatives.
-
 """
 
 from collections.abc import Callable, Sequence

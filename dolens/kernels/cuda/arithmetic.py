@@ -10,7 +10,6 @@ the same bits.  Rays that are not `alive` may hold anything, NaN too, and do not
 
 Jacobians need what each ray adds.  Their rows belong to one ray each: a place is then a block of
 pointers, one for every ray, and nothing is summed over them.
-
 """
 
 import triton

@@ -5,7 +5,6 @@ Newton's iteration finds the intercept on a surface that is given by its sag.
 A surface's gradient g = ∇F at a point, F's second derivatives, and cotangents of its numbers.
 
 F = z - sag, or a conic's implicit form; the unit normal is g/|g|.
-
 """
 
 import triton

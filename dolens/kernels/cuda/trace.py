@@ -5,7 +5,6 @@ The backward pass traces each block again, keeps its states, and sweeps cotangen
 A fixed number of programs share the blocks of all lenses.  Each has its own memory for the states
 of one block, and each lens as many rows of sums as programs share it, so that neither grows with
 the number of rays.
-
 """
 
 import triton

@@ -7,7 +7,6 @@ n coefficients need n + 4 knots t_0 ≤ ... ≤ t_(n+3); the spline lives on [t_
 multiplicity m leaves 3 - m continuous derivatives there: two at a simple knot, a crease at a
 triple one, a step at a quadruple one.  At such a knot the branch on its right is taken, and at
 the last knot the one on its left.
-
 """
 
 from collections.abc import Mapping, Sequence

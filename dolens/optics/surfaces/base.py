@@ -4,7 +4,6 @@ Whether a ray is valid is carried as margins: numbers that are positive where a 
 The minimum of all margins decides at the end.  Comparing and selecting by masks costs five times
 the arithmetic, so invalid rays are kept finite by clamps instead, at limits that no valid ray
 reaches; their gradient is cut off where the trace ends.
-
 """
 
 import math

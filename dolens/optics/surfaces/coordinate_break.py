@@ -4,7 +4,6 @@
 
 The lens's axes are those of its first row, before any break: light comes towards +z.  All is in
 double precision, whatever the lens's: a difference of places metres away keeps what surfaces need.
-
 """
 
 from collections.abc import Mapping, Sequence

@@ -4,7 +4,6 @@ Q_bfs comes from its recurrence with auxiliary polynomials.
 
 Source: Forbes, Robust, efficient computational methods for axially symmetric optical aspheres,
 Opt. Express 18, 19700 (2010).
-
 """
 
 import math

@@ -1,7 +1,6 @@
 """A surface is given by its sag on a regular grid, on top of an even asphere.
 
 Between the nodes the sag is bicubic (Hermite's form), from values and slopes at the nodes.
-
 """
 
 from collections.abc import Mapping

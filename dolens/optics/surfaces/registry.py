@@ -3,7 +3,6 @@
 The registry knows surfaces by the `type` of a prescription: this library's and a user's own.
 
 A prescription names a type, and no code.  What is not registered cannot be named.
-
 """
 
 import inspect

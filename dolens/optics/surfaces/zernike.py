@@ -5,7 +5,6 @@ Jacobi polynomials P_k^(0, m)(2q - 1) on 0 ≤ q ≤ 1, by their three-term recu
 They are the radial part of Zernike's polynomials, R_n^m(ρ) = ρ^m·P_k^(0, m)(2ρ² - 1) with
 k = (n - m)/2, and with m = 4 Forbes's Q_con.  Recurrence keeps them accurate to any order, where
 powers of q with their alternating coefficients would lose all digits.
-
 """
 
 import math

@@ -8,7 +8,6 @@ Rays of all wavelengths meet the first surface at the same points.
 
 Only refraction differs.  With d' = μ·d + Γ·N a known refraction gives the normal, N ∥ d' - μ·d;
 another wavelength's differs by (Δμ)·d + (ΔΓ)·N: no second search for the intersection.
-
 """
 
 import math

@@ -8,7 +8,6 @@ The renderer's backward driver makes the samples again, traces them, and sweeps 
 
 Sums are kept for every group of blocks.  Groups do not depend on the number of threads, and each is
 one worker's: neither does the result.
-
 """
 
 from collections.abc import Callable
