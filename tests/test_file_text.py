@@ -15,7 +15,7 @@ from dolens.file_text import read_file
 from dolens.lens_page.offenders import _read as read_tolerances
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.glass_folders import glass_folders
-from dolens.prescriptions.check_files import check_file
+from dolens.prescriptions.files import check_file
 
 UNREADABLE = {
     "pipe": "is a pipe, no ",

@@ -13,11 +13,9 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import radius_of
-from dolens.prescriptions.json_values import difference, mapping, number, rows
-from dolens.prescriptions.paraxial_image import paraxial_image
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import as_number, radius_of
+from dolens.prescriptions.other_programs import ReadPrescription, paraxial_image
+from dolens.prescriptions.plain_values import difference, mapping, number, rows
 
 _STOPS = ("Aperture", "Stop")
 _NOT_HELD = {

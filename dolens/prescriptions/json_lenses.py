@@ -12,10 +12,10 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.deeplens_json import read_deeplens
-from dolens.prescriptions.json_values import Watched, passed_over
 from dolens.prescriptions.optiland_json import read_optiland
+from dolens.prescriptions.other_programs import ReadPrescription
+from dolens.prescriptions.plain_values import Watched, passed_over
 from dolens.prescriptions.ray_optics_json import read_ray_optics
-from dolens.prescriptions.read_file import ReadPrescription
 
 # Longer text is no number that a program writes, and is slow to read.
 _LONGEST_NUMBER = 400

@@ -10,12 +10,10 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.curved_object import curved_object
-from dolens.prescriptions.decimals import radius_of
-from dolens.prescriptions.field_data import unequal_weights
-from dolens.prescriptions.json_values import mapping, number, require_unset, rows
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import as_number, radius_of
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.plain_values import mapping, number, require_unset, rows
+from dolens.prescriptions.system_data import unequal_weights
 
 _MAKERS = ("Schott", "Ohara", "Hoya", "CDGM", "Hikari", "Sumita")
 _FIELDS = {

@@ -17,9 +17,9 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.elements import TILTS
 from dolens.optics.surfaces.coordinate_break import BREAK, DECENTERS
-from dolens.prescriptions.breaks import KIND
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.zemax_block import NAMED_ZERO, SurfaceBlock
+from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.row_data import BREAK_KIND
+from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 
 _ORDER = 6
@@ -29,7 +29,7 @@ def _read(block: SurfaceBlock) -> Row:
     """Return the numbers that are not zero, and those that a writer named."""
     if block.words("GLAS"):
         raise InputError(f"{block.place}: a coordinate break with a medium (GLAS) is not held")
-    row: Row = {"type": KIND}
+    row: Row = {"type": BREAK_KIND}
     for n, name in enumerate(BREAK, 1):
         value = block.parameter(n, 1 if name in DECENTERS else 0)
         if value or block.parameters.get(n) == NAMED_ZERO:
@@ -55,5 +55,5 @@ def _write(row: Mapping[str, Any], place: str) -> list[str]:
 
 
 COORDINATE_BREAK = ZemaxShape(
-    "COORDBRK", (KIND,), _read, _write, parameters=None, extra_data=None, surface=False
+    "COORDBRK", (BREAK_KIND,), _read, _write, parameters=None, extra_data=None, surface=False
 )

@@ -22,11 +22,10 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
-from dolens.prescriptions.checks import as_integer, as_number
-from dolens.prescriptions.decimals import number_in_text, scaled, shifted
-from dolens.prescriptions.deflections import power_of
+from dolens.prescriptions.numbers import as_integer, as_number, number_in_text, scaled, shifted
+from dolens.prescriptions.row_data import power_of
+from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_biconic_toroid import TOROID
-from dolens.prescriptions.zemax_block import NAMED_ZERO, SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import STANDARD

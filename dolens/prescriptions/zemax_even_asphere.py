@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.zemax_block import NAMED_ZERO, SurfaceBlock, curvature_row
+from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 

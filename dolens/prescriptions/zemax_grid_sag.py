@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import number_in_text, scaled
-from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
+from dolens.prescriptions.numbers import as_number, number_in_text, scaled
+from dolens.prescriptions.zemax.file import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_polynomials import named, power_lines
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line

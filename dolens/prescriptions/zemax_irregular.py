@@ -9,7 +9,7 @@ aberrations; these are held where they do nothing.
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
+from dolens.prescriptions.zemax.file import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import STANDARD
 

@@ -14,9 +14,8 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.surfaces.even_asphere import power_of
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import number_in_text, scaled
-from dolens.prescriptions.zemax_block import NAMED_ZERO, SurfaceBlock, curvature_row
+from dolens.prescriptions.numbers import as_number, number_in_text, scaled
+from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 

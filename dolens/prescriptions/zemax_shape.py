@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax.file import SurfaceBlock
 
 Row = dict[str, Any]
 

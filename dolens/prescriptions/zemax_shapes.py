@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
-from dolens.prescriptions.zemax_block import SurfaceBlock
 from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
 from dolens.prescriptions.zemax_diffractive import (
     BINARY_1,

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
+from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.zemax.file import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.surfaces.zernike import ZernikeFringe, ZernikeSag, ZernikeStandard
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
+from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.zemax.file import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_polynomials import (
     named,
     number_of_terms,

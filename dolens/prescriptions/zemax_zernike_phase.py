@@ -16,9 +16,8 @@ from dolens.optics.surfaces.zernike_phase import (
     ZernikePhase,
     ZernikeStandardPhase,
 )
-from dolens.prescriptions.checks import as_integer, as_number
-from dolens.prescriptions.decimals import number_in_text
-from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.numbers import as_integer, as_number, number_in_text
+from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax_diffractive import conic_base
 from dolens.prescriptions.zemax_polynomials import named, number_of_terms, positive_extra, text
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape

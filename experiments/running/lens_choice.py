@@ -17,7 +17,7 @@ from dolens.errors import InputError, readable
 from dolens.experiments.running.override_text import override_text
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.files import SUFFIXES, read_lens_file
-from dolens.prescriptions.yaml_text import yaml_of
+from dolens.prescriptions.plain_values import yaml_of
 from dolens.user_cache import user_cache_folder, write_whole
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dolens.errors import InputError, one_line
-from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.plain_values import plain_values
 from dolens.whole_files import written_whole
 
 INFO, METRICS = "run.json", "metrics.json"

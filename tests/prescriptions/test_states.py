@@ -7,7 +7,7 @@ import torch
 
 from dolens import InputError, load_lens, save_lens
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_reader import read_zemax
+from dolens.prescriptions.zemax.reader import read_zemax
 from tests.prescriptions.samples import SINGLET
 from tests.prescriptions.zemax_samples import triplet
 

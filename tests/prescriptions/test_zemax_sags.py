@@ -7,8 +7,8 @@ import torch
 
 from dolens import InputError, Rays
 from dolens.prescriptions import lens_from_prescription
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import singlet
 
 GLASS = "GLAS ___BLANK 1 0 1.5 6.0E+1 0 0 0 0 0 0"

@@ -8,14 +8,12 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.checks import as_integer, as_number
-from dolens.prescriptions.codev.apertures import aperture_lines
-from dolens.prescriptions.codev.axes import break_words
 from dolens.prescriptions.codev.glass import glass_word, private_glass
-from dolens.prescriptions.codev.reader import read_codev
-from dolens.prescriptions.codev.special import special_lines
-from dolens.prescriptions.compare import require_same
-from dolens.prescriptions.media import canonical_digits
+from dolens.prescriptions.codev.reader import break_words, read_codev
+from dolens.prescriptions.codev.surface import aperture_lines, special_lines
+from dolens.prescriptions.numbers import as_integer, as_number
+from dolens.prescriptions.other_programs import require_same
+from dolens.prescriptions.row_data import canonical_digits
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 _TYPES = (

@@ -1,11 +1,26 @@
-"""A written lens file is read again and compared with its prescription."""
+"""Readers and writers of other programs' lens files share what is here."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.deflections import power_of
+from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.row_data import power_of
+
+
+class ReadPrescription(NamedTuple):
+    """A `ReadPrescription` is the content of a lens file as plain data.
+
+    Attributes:
+        prescription: as `lens_from_prescription` takes it.
+        passed_over: what the file says that bends no ray and is not held, in words, such as
+            `coatings (COAT)`; nothing that changes a ray's way is among it.
+    """
+
+    prescription: Any
+    passed_over: list[str]
+
 
 _DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
 
@@ -149,3 +164,133 @@ def _plain(value: Any) -> Any:
         return as_number(str(value), "")
     except InputError:
         return str(value)
+
+
+def curved_object(
+    prescription: Mapping[str, Any], shape: Mapping[str, Any], place: str
+) -> list[str]:
+    """Return a sentence about the curvature of an object, for the list of what is passed over;
+    nothing of a plane one.
+
+    Args:
+        prescription: with the fields and `object_distance` of its file.
+        shape: of the object, as a row of a prescription has it.
+        place: the object's name in messages.
+
+    Raises:
+        InputError: the object is at a finite distance, and fields are off its axis.
+    """
+    radius = shape.get("radius", math.inf)
+    if shape.get("curvature"):
+        radius = 1.0 / shape["curvature"]
+    departs = any(value for key, value in shape.items() if key[:1] in "ab" and key[1:].isdecimal())
+    if math.isinf(radius) and not departs:
+        return []
+    what = "aspheric" if math.isinf(radius) else f"radius {radius:.6g} mm"
+    if prescription.get("object_distance") is not None and not _is_axial(prescription):
+        raise InputError(
+            f"{place}: a curved object ({what}) is not held for fields off the axis (allowed: a "
+            "plane, fields on the axis, or an object at infinity)"
+        )
+    return [f"the curvature of the object ({what}), of which light meets the vertex alone"]
+
+
+def _is_axial(prescription: Mapping[str, Any]) -> bool:
+    fields = prescription.get("fields") or {}
+    kinds = fields.keys() - {"weights", "vignetting"}
+    return not any(part for kind in kinds for point in fields[kind] for part in point)
+
+
+def catalogue_order(
+    glasses: Iterable[tuple[str, str]], must_precede: Callable[[str, str, str], bool]
+) -> list[str] | None:
+    """Return the catalogues in an order where the first that has a name is the one meant.
+
+    Args:
+        glasses: catalogue and name of each glass.
+        must_precede: whether a catalogue must stand before another one because of a name, which
+            the other has as well: called with the catalogue, the name and the other.
+
+    Returns:
+        The order, by the alphabet where nothing else decides; None where there is none.
+    """
+    pairs = list(glasses)
+    left = sorted({catalogue for catalogue, _ in pairs})
+    before = {
+        other: {
+            catalogue
+            for catalogue, name in pairs
+            if catalogue != other and must_precede(catalogue, name, other)
+        }
+        for other in left
+    }
+    order: list[str] = []
+    while left:
+        free = next((c for c in left if before[c].isdisjoint(left)), None)
+        if free is None:
+            return None
+        order.append(free)
+        left.remove(free)
+    return order
+
+
+class ParaxialImage(NamedTuple):
+    """A `ParaxialImage` is where an axial paraxial ray meets the axis behind the last surface.
+
+    Attributes:
+        distance: from the last vertex, mm along z.
+        focal_length: of the surfaces for light from infinity, mm.
+    """
+
+    distance: float
+    focal_length: float
+
+
+def paraxial_image(
+    curvatures: Sequence[float],
+    gaps: Sequence[float],
+    indices: Sequence[float],
+    object_distance: float | None,
+    place: str,
+) -> ParaxialImage:
+    """Trace the paraxial axial ray by n'u' = nu - y·c·(n' - n) and y' = y + t·u'.
+
+    Args:
+        curvatures: of the surfaces, 1/mm.
+        gaps: behind all surfaces but the last, mm.
+        indices: in front of the first surface and behind each; negative where light travels
+            towards -z.
+        object_distance: in front of the first surface, mm; None for infinity.
+        place: name in messages.
+
+    Raises:
+        InputError: the light leaves the last surface parallel to the axis, or a number overflows.
+    """
+    height, reduced = _behind(curvatures, gaps, indices, 1.0, 0.0)
+    power = -reduced
+    if object_distance is not None:
+        start = object_distance / indices[0]
+        height, reduced = _behind(curvatures, gaps, indices, start, 1.0)
+    if reduced == 0.0:
+        raise InputError(f"{place}: the paraxial image is at infinity, and no solve can place it")
+    distance = -height * indices[-1] / reduced
+    if not math.isfinite(distance):
+        raise InputError(f"{place}: numbers are too large to find the paraxial image")
+    focal_length = indices[-1] / power if power else math.inf
+    return ParaxialImage(distance, focal_length)
+
+
+def _behind(
+    curvatures: Sequence[float],
+    gaps: Sequence[float],
+    indices: Sequence[float],
+    height: float,
+    reduced: float,
+) -> tuple[float, float]:
+    """Return height and n·u of a ray behind the last surface."""
+    for i, curvature in enumerate(curvatures):
+        before, behind = indices[i], indices[i + 1]
+        reduced -= height * curvature * (behind - before)
+        if i < len(gaps):
+            height += gaps[i] * reduced / behind
+    return height, reduced

@@ -20,11 +20,112 @@ from typing import Any
 
 from dolens.errors import InputError, comma_hint
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.numbers import number_in_text
 from dolens.prescriptions.states import MOST_STATES
 from dolens.prescriptions.system_data import PUPIL_KEYS
-from dolens.prescriptions.zemax import Line, ZemaxFile
-from dolens.prescriptions.zemax_settings import apply_setting
+from dolens.prescriptions.zemax.file import Line, ZemaxFile
+from dolens.prescriptions.zemax.system import last
+
+# Operand → that of the surface whose first argument it is.
+OF_SURFACES = {"THIC": "DISZ", "CRVT": "CURV", "CONN": "CONI", "SDIA": "DIAM"}
+# Operand → that of the surface, and which argument it is.
+OF_APERTURES = {"APMN": ("CLAP", 0), "APMX": ("CLAP", 1)}
+# Operand → lists of the system, one number a field.
+OF_FIELDS = {
+    "XFIE": ("XFLN", "XFLD"),
+    "YFIE": ("YFLN", "YFLD"),
+    "FLWT": ("FWGN", "FWGT"),
+    "FVDX": ("VDXN", "ZVDX"),
+    "FVDY": ("VDYN", "ZVDY"),
+    "FVCX": ("VCXN", "ZVCX"),
+    "FVCY": ("VCYN", "ZVCY"),
+    "FVAN": ("VANN", "ZVAN"),
+}
+# Operand → which argument of WAVM it is, and lists of older files, one number a wavelength.
+OF_WAVELENGTHS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "WAVE": (1, ("WAVL", "WAVN")),
+    "WLWT": (2, ("WWGT", "WWGN")),
+}
+_PUPILS = ("OBNA", "ENPD", "FNUM")
+_AIR_OPERANDS = ("TEMP", "PRES")
+_PARAMETER = re.compile(r"PAR(\d)")
+
+
+def apply_setting(file: ZemaxFile, line: Line) -> None:
+    """Put the number of a line behind MNUM into its place among the surfaces and the system.
+
+    Raises:
+        InputError: the operand is none that is held, or its place is not there.
+    """
+    operand, (target, _, value) = line.operand, line.arguments[:3]
+    at = int(number_in_text(target, f"line {line.at}"))
+    parameter = _PARAMETER.fullmatch(operand)
+    if operand in OF_SURFACES:
+        _replace(_surface(file, at, line), OF_SURFACES[operand], 0, value)
+    elif operand in OF_APERTURES:
+        kind, place = OF_APERTURES[operand]
+        _replace(_surface(file, at, line), kind, place, value)
+    elif operand == "PRAM" or parameter:
+        # Files of old have the parameter's number elsewhere.
+        number = parameter[1] if parameter else (*line.arguments, *"00000")[4]
+        lines = _surface(file, at, line).setdefault("PARM", [])
+        if number == "0":
+            raise InputError(f"{operand} of surface {at} does not say which parameter it is")
+        lines[:] = [one for one in lines if one.arguments[:1] != [number]]
+        lines.append(Line(line.at, "PARM", [number, value], f"{number} {value}"))
+    elif operand in OF_FIELDS:
+        lists = [name for name in OF_FIELDS[operand] if name in file.system]
+        if not lists or "FEFD" in file.system:
+            raise InputError(f"{operand} {at} has no place in the lists of fields")
+        for name in lists:
+            _replace(file.system, name, at - 1, value)
+    elif operand in OF_WAVELENGTHS:
+        place, older = OF_WAVELENGTHS[operand]
+        lines = file.system.get("WAVM", [])
+        for n, one in enumerate(lines):
+            if one.arguments[:1] == [str(at)]:
+                words = [*one.arguments, "1"][:3]
+                lines[n] = one._replace(arguments=[*words[:place], value, *words[place + 1 :]])
+        for name in older:
+            if name in file.system and len(file.system[name][-1].arguments) >= at:
+                _replace(file.system, name, at - 1, value)
+    elif operand == "APER":
+        given = [
+            name
+            for name in _PUPILS
+            if name in file.system and number_in_text(file.system[name][-1].arguments[0], "")
+        ]
+        if "FLOA" in file.system or len(given) != 1:
+            raise InputError("APER sets an aperture that the file does not have")
+        _replace(file.system, given[0], 0, value)
+    elif operand in _AIR_OPERANDS and not _indices_follow_air(file):
+        return
+    else:
+        raise InputError(f"{operand} {target} is not held")
+
+
+def _indices_follow_air(file: ZemaxFile) -> bool:
+    lines = file.system.get("ENVD")
+    return lines is not None and lines[-1].arguments[2:3] == ["1"]
+
+
+def _surface(file: ZemaxFile, number: int, line: Line) -> dict[str, list[Line]]:
+    if not 0 <= number < len(file.surfaces):
+        raise InputError(f"{line.operand} {number}: there is no such surface")
+    return file.surfaces[number]
+
+
+def _replace(lines: dict[str, list[Line]], operand: str, place: int, value: str) -> None:
+    """Replace an argument of an operand's last line."""
+    if operand not in lines or len(lines[operand][-1].arguments) <= place or place < 0:
+        raise InputError(f"there is no {operand} whose number would change")
+    last = lines[operand][-1]
+    words = [*last.arguments[:place], value, *last.arguments[place + 1 :]]
+    if operand == "DIAM":
+        # A size that is set is the user's own, not the program's.
+        words[1:2] = ["1"]
+    lines[operand] = [*lines[operand][:-1], last._replace(arguments=words, text=" ".join(words))]
+
 
 Read = Callable[[ZemaxFile], dict[str, Any]]
 
@@ -279,3 +380,55 @@ def _names(
 def own_title(lens: Mapping[str, Any]) -> str:
     """Return the title of a configuration that is the lens itself and none of its states."""
     return f"the lens itself: {lens.get('name', '')}".strip()
+
+
+# Temperature and pressure, and what a file without ENVD means by them.
+_AIR = {"TEMP": 20.0, "PRES": 1.0}
+# Lines round what ENVD says to a dozen digits.
+_SAME_AIR = 1e-6
+
+
+def refuse_own_air(file: ZemaxFile, where: str) -> None:
+    """Refuse media at a temperature or pressure that is not the system's.
+
+    TEMP and PRES hold for the GLSS behind them, in the same configuration: so a lens may stand in a
+    vacuum between windows.  Where MNUM does not say which configuration is the current one, one
+    must be as the system is.
+
+    Raises:
+        InputError: a GLSS of the current configuration stands behind another temperature or
+            pressure than ENVD has.
+    """
+    begin = file.system.get("MNUM")
+    if not begin or not begin[-1].arguments:
+        return
+    place = f"{where}: line {begin[-1].at}: MNUM"
+    count, *current = (number_in_text(word, place) for word in begin[-1].arguments[:2])
+    # Older files give no current one.
+    candidates = [current[0] or 1.0] if current else range(1, int(count) + 1)
+    found = [_own_air(file, where, number) for number in candidates]
+    if found and all(found):
+        raise InputError(f"{where}: {found[0]}")
+
+
+def _own_air(file: ZemaxFile, where: str, configuration: float) -> str:
+    """Return which medium has a temperature or pressure of its own, nothing where none has."""
+    line = last(file, "ENVD")
+    given = [number_in_text(word, f"{where}: ENVD") for word in line.arguments[:2]] if line else []
+    air = _AIR | dict(zip(_AIR, given, strict=False))
+    here = air
+    for line in configuration_lines(file):
+        place = f"{where}: line {line.at}: {line.operand}"
+        if line.operand not in (*_AIR, "GLSS") or len(line.arguments) < 3:
+            continue
+        if number_in_text(line.arguments[1], place) != configuration:
+            continue
+        if line.operand in _AIR:
+            here = {**here, line.operand: number_in_text(line.arguments[2], place)}
+        elif any(abs(here[key] - air[key]) > _SAME_AIR for key in _AIR):
+            return (
+                f"surface {line.arguments[0]}: a medium at a temperature or pressure of its own is "
+                f"not held (GLSS behind TEMP {here['TEMP']:g} and PRES {here['PRES']:g}, line "
+                f"{line.at})"
+            )
+    return ""

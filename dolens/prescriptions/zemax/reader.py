@@ -1,11 +1,11 @@
 """The text of a Zemax `.zmx` file is converted to a prescription.
 
-Held: sequential systems of the shapes in `zemax_shapes`, glass by model (nd, Vd) or by its name
-in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
-(`zemax_apertures`), fields and wavelengths with their weights (`zemax_fields`), and UNIT MM, CM, IN
+Held: sequential systems of the shapes in `shapes`, glass by model (nd, Vd) or by its name
+in the catalogues of GCAT (`glass`), circular and rectangular apertures and obscurations
+(`apertures`), fields and wavelengths with their weights (`system`), and UNIT MM, CM, IN
 or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
-listed (`zemax_passed_over`).
+listed (`passed_over`).
 
 Surfaces keep their numbers, but for those that the file says to ignore, and behind one that has a
 tilt or decenter of its own, which becomes coordinate breaks around it.  Only planes before the
@@ -14,6 +14,22 @@ image that neither refract nor clip are left out, and their gaps added to the se
 As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone
 draws and clips nothing.  ENPD, FNUM and OBNA close the stop (see
 `dolens.prescriptions.system_data`); with FLOA its DIAM does.
+
+A surface's own decenters and tilts are a coordinate break in front of it, and another between it
+and its thickness::
+
+    SCBD 1 order 0 dx dy tx ty tz       # before the surface
+    SCBD 2 order status dx dy tx ty tz  # after it
+
+As of a break, order 0 decentres and then turns about x, y and z, any other turns about z, y and x
+first.  The status says where the numbers after the surface come from: 0 they are its own, 1 they
+are those before it, 2 those undo them, with their signs and the order reversed; from 3 on they are
+those of another surface.  Zemax writes the resulting numbers in each case.  SCBD 3 says of a
+coordinate break that it returns to an earlier surface, and its numbers stand in PARM.
+
+Source: OpticStudio's help, "Tilt/Decenter" (surface properties).  Files agree: a fold mirror of 45°
+has the same 45° after it with status 1, and a surface turned by 90° about z, -90° with status 2 and
+the other order.
 """
 
 import math
@@ -25,24 +41,85 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
-from dolens.optics.surfaces.coordinate_break import BREAK as BREAK_KEYS
+from dolens.optics.surfaces.coordinate_break import BREAK, DECENTERS
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.breaks import KIND as BREAK
-from dolens.prescriptions.curved_object import curved_object
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import number_in_text, scaled
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
-from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
-from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
-from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_configurations import read_configurations
-from dolens.prescriptions.zemax_glass import read_glass
-from dolens.prescriptions.zemax_own_air import refuse_own_air
-from dolens.prescriptions.zemax_own_axes import own_axes
-from dolens.prescriptions.zemax_passed_over import passed_over
+from dolens.prescriptions.zemax.apertures import is_fixed, read_apertures
+from dolens.prescriptions.zemax.configurations import read_configurations, refuse_own_air
+from dolens.prescriptions.zemax.file import (
+    Line,
+    SurfaceBlock,
+    ZemaxFile,
+    curvature_row,
+    parse_zemax,
+)
+from dolens.prescriptions.zemax.glass import read_glass
+from dolens.prescriptions.zemax.passed_over import passed_over
+from dolens.prescriptions.zemax.system import factor_to_mm, read_system
 from dolens.prescriptions.zemax_shape import Row
 from dolens.prescriptions.zemax_shapes import shape_of_block
-from dolens.prescriptions.zemax_system import factor_to_mm, read_system
+
+_BEFORE, _AFTER, _RETURN = "1", "2", "3"
+_SAME, _REVERSED = 1.0, 2.0
+# Behind the kind: order and status.
+_NUMBERS = 3
+
+
+def own_axes(block: SurfaceBlock) -> tuple[Row | None, Row | None]:
+    """Return the rows of the breaks before and after a surface, None where nothing moves.
+
+    Raises:
+        InputError: a coordinate break has any, or the numbers after a surface are not those that
+            its status says.
+    """
+    before, after, status = None, None, 0.0
+    for line in block.lines.get("SCBD", []):
+        place = f"{block.place}: SCBD (line {line.at})"
+        kind = (line.arguments or [""])[0]
+        if kind == _RETURN:
+            continue
+        row = _axes_row(block, line.arguments, place)
+        if kind == _BEFORE:
+            before = row
+        elif kind == _AFTER:
+            after = row
+            status = number_in_text((*line.arguments, "0", "0", "0")[2], place)
+        elif row is not None:
+            raise InputError(f"{place}: kind {kind} is not known (allowed: 1, 2, 3)")
+    if block.type == "COORDBRK" and (before or after):
+        raise InputError(f"{block.place}: a coordinate break with axes of its own is not held")
+    sign = {_SAME: 1.0, _REVERSED: -1.0}.get(status)
+    if sign and _numbers(after) != {n: sign * v for n, v in _numbers(before).items()}:
+        raise InputError(
+            f"{block.place}: SCBD: the tilts and decenters after the surface are not those before "
+            f"it{', reversed' if status == _REVERSED else ''}, as the file says they are"
+        )
+    return before, after
+
+
+def _axes_row(block: SurfaceBlock, words: list[str], place: str) -> Row | None:
+    """Return the numbers of a break that are not zero; None where all are."""
+    row: Row = {"type": BREAK_KIND}
+    for name, word in zip(BREAK, words[_NUMBERS:], strict=False):
+        value = (
+            scaled(word, block.factor, place) if name in DECENTERS else number_in_text(word, place)
+        )
+        if value:
+            row[name] = value
+    if len(row) == 1:
+        return None
+    if number_in_text((*words, "0", "0")[1], place):
+        row["order"] = "tilt_first"
+    return row
+
+
+def _numbers(row: Row | None) -> dict[str, float]:
+    return {name: row[name] for name in BREAK if name in row} if row else {}
+
 
 # Zemax writes INFINITY, and takes any distance from here on for it.
 _INFINITE = 1e10
@@ -107,7 +184,7 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
             hard.append(False)
         rows.append(row)
         hard.append(clips)
-        if block.stop and row["type"] == BREAK:
+        if block.stop and row["type"] == BREAK_KIND:
             rows.append(_stop_behind(row, block.place, medium, pupil))
             hard.append(False)
         if block.stop:
@@ -189,7 +266,7 @@ def _stop_behind(row: Row, place: str, medium: str, pupil: bool) -> Row:
     Raises:
         InputError: the break does more, or the stop has no size.
     """
-    moves = [name for name in BREAK_KEYS if name != "tilt_z" and row.get(name)]
+    moves = [name for name in BREAK if name != "tilt_z" and row.get(name)]
     if moves:
         raise InputError(
             f"{place}: a stop on a coordinate break that decentres or tilts the axis is not held "

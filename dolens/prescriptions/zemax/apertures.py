@@ -4,23 +4,24 @@
 rectangle of half widths, `ELAP` an ellipse; `OBSC`, `SQOB` and `ELOB` block such outlines, and
 `OBSC` with an inner radius blocks a ring.  `SPID` is a spider: the width of its arms and their
 number, the first along +x.  `USAP` and `USOB` are outlines that the user draws, whose corners
-`UDAD` lists (`zemax_drawn_outlines`).  A surface has one of them, and `OBDC` says where it is
+`UDAD` lists.  A surface has one of them, and `OBDC` says where it is
 beside the vertex.
 
 `DIAM` is the semi-diameter that a surface is drawn to, and clips nothing, whether a user or Zemax
 has written it.  `DIAM 0`, or none, leaves the size to the light of the fields.
+
+`UDAD 0 name scale` names the `.UDA` file that they were drawn in, and `UDAD n x y angle` gives the
+corners in turn.  `0 0` ends a polygon.  An angle other than zero makes a side an arc.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import number_in_text, scaled
-from dolens.prescriptions.zemax import Line
-from dolens.prescriptions.zemax_drawn_outlines import polygon_lines, read_polygons
+from dolens.prescriptions.numbers import as_number, number_in_text, scaled
+from dolens.prescriptions.zemax.file import Line
 
 Block = Mapping[str, list[Line]]
 
@@ -178,3 +179,81 @@ def _words(block: Block, operand: str) -> list[str]:
 def _text(value: object, place: str) -> str:
     number = as_number(value, place)
     return repr(number) if number else "0"
+
+
+# Each is compared with all others.
+_MOST_POLYGONS = 1000
+
+
+def read_polygons(
+    block: Mapping[str, list[Line]], factor: Fraction, place: str
+) -> list[list[list[float]]]:
+    """Return the corners of the polygons of a surface, mm.
+
+    Raises:
+        InputError: the corners are in another file, or a side is an arc, or the outline is scaled,
+            or polygons lie in one another.
+    """
+    polygons: list[list[list[float]]] = [[]]
+    file = "another file"
+    for line in block.get("UDAD", []):
+        words, what = line.arguments, f"{place} (line {line.at})"
+        if len(words) < 3:
+            raise InputError(f"{what}: UDAD needs a number, x and y")
+        if number_in_text(words[0], what) == 0:
+            file = " ".join(words[1:-1]).strip('"')
+            if number_in_text(words[-1], what) != 1.0:
+                raise InputError(f"{what}: an outline drawn to another scale is not held")
+            continue
+        if any(number_in_text(word, what) for word in words[3:]):
+            raise InputError(f"{what}: an outline with arcs is not held")
+        corner = [scaled(word, factor, what) for word in words[1:3]]
+        if any(corner):
+            polygons[-1].append(corner)
+        else:
+            polygons.append([])
+    polygons = [_open(polygon) for polygon in polygons if polygon]
+    if not polygons:
+        raise InputError(f"{place}: the outline that the user draws stands in {file}, not here")
+    if any(len(polygon) < 3 for polygon in polygons):
+        raise InputError(f"{place}: an outline that the user draws needs three corners at least")
+    if len(polygons) > _MOST_POLYGONS:
+        raise InputError(
+            f"{place}: {len(polygons)} outlines that the user draws (allowed: {_MOST_POLYGONS})"
+        )
+    _require_apart(polygons, place)
+    return polygons
+
+
+def polygon_lines(polygons: Sequence[Sequence[Sequence[float]]], place: str) -> list[str]:
+    """Return the lines that `read_polygons` reads back.
+
+    Raises:
+        InputError: a corner at 0, 0, which would end its polygon.
+    """
+    lines = ['UDAD 0 "OUTLINE.UDA" 1']
+    for polygon in polygons:
+        for corner in polygon:
+            x, y = (as_number(value, place) for value in corner)
+            if not (x or y):
+                raise InputError(f"{place}: a .zmx file holds no corner of a polygon at 0, 0")
+            lines.append(f"UDAD {len(lines)} {x!r} {y!r} 0")
+        lines.append(f"UDAD {len(lines)} 0 0 0")
+    return lines
+
+
+def _open(polygon: list[list[float]]) -> list[list[float]]:
+    """Return a polygon without a last corner that is the first again."""
+    return polygon[:-1] if len(polygon) > 1 and polygon[0] == polygon[-1] else polygon
+
+
+def _require_apart(polygons: list[list[list[float]]], place: str) -> None:
+    """Refuse polygons that may lie in one another, which programs take in different ways."""
+    boxes = [
+        [(min(values), max(values)) for values in zip(*polygon, strict=True)]
+        for polygon in polygons
+    ]
+    for number, one in enumerate(boxes):
+        for other in boxes[:number]:
+            if all(a[0] < b[1] and b[0] < a[1] for a, b in zip(one, other, strict=True)):
+                raise InputError(f"{place}: outlines that lie in one another are not held")
