@@ -1,11 +1,13 @@
 """Readers and writers of other programs' lens files share what is here."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from fractions import Fraction
 from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.numbers import as_number, nearest, number_in_text, scaled
 from dolens.prescriptions.row_data import power_of
 
 
@@ -20,6 +22,127 @@ class ReadPrescription(NamedTuple):
 
     prescription: Any
     passed_over: list[str]
+
+
+class Number(NamedTuple):
+    """A `Number` is what stands in one slot of a file: a key of a surface's row, and its unit.
+
+    Tables of them, slot → number, drive readers and writers: `{"PARM 2": Number("a4", -3)}` is the
+    coefficient of r⁴, in units of a length to the power of -3, behind the words `PARM 2`.
+
+    Attributes:
+        key: in a prescription's row.
+        power: of the file's unit of length; the row has mm to that power.
+        rule: which texts count: "" all but zeros that nobody named, `ALWAYS` a number that every
+            surface has, or another rule of the format's own.
+        default: what the row means where it does not have the key; None where it must.
+        shift: of the decimal point, from the file to the row.
+    """
+
+    key: str
+    power: int = 0
+    rule: str = ""
+    default: float | None = None
+    shift: int = 0
+
+
+ALWAYS = "always"
+Table = Mapping[str, Number]
+# Coefficients of rotational powers, Forbes's and Zernike's polynomials, phases, and monomials.
+_TERM = re.compile(r"[apqz]\d+|(?=[xy])(x\d*)?(y\d*)?")
+
+
+def powers_of_r(slots: Iterable[str], powers: Iterable[int]) -> dict[str, Number]:
+    """Return the slots of the coefficients of powers of r."""
+    return {slot: Number(f"a{n}", 1 - n) for slot, n in zip(slots, powers, strict=True)}
+
+
+def monomials(degree: int) -> dict[str, int]:
+    """Return the monomials of x and y, and the degree of each, in the order that programs number
+    them in: x, y, x2, xy, y2, ...
+
+    Args:
+        degree: the highest.
+    """
+
+    def power(letter: str, n: int) -> str:
+        return f"{letter}{n if n > 1 else ''}" if n else ""
+
+    degrees = range(1, degree + 1)
+    return {power("x", d - j) + power("y", j): d for d in degrees for j in range(d + 1)}
+
+
+def row_numbers(
+    table: Table,
+    words: Mapping[str, str],
+    unit: Callable[[str, Number], Fraction],
+    place: str,
+    counts: Callable[[str], bool],
+) -> dict[str, float]:
+    """Return the numbers of a surface's row that a file has in its slots, in mm.
+
+    Args:
+        table: of the slots.
+        words: slot → number as it is written; what is missing counts as 0 where there is a rule.
+        unit: what 1 in a slot means in the row, given slot and number.
+        place: name of the surface in messages.
+        counts: whether a text says anything where there is no rule: no zero that nobody named.
+
+    Raises:
+        InputError: a text is no number, or one out of range.
+    """
+    found: dict[str, float] = {}
+    exact: dict[str, Fraction] = {}
+    for slot, number in table.items():
+        word = words.get(slot, "0" if number.rule else None)
+        if word is None:
+            continue
+        number_in_text(word, f"{place}: {slot}")
+        if not (number.rule or counts(word)):
+            continue
+        scale = unit(slot, number)
+        value = scaled(word, scale, f"{place}: {slot}")
+        if number.key in exact:
+            # A coefficient in two slots.
+            value = nearest(exact[number.key] + Fraction(word) * scale, f"{place}: {slot}")
+        elif value:
+            exact[number.key] = Fraction(word) * scale
+        found[number.key] = value
+    return found
+
+
+def slot_values(
+    table: Table, row: Mapping[str, Any], place: str, suffix: str, what: str = ""
+) -> dict[str, float]:
+    """Return slot → number of what a row has, for a writer: coefficients in their order in the row,
+    and then the others; lengths are in mm.
+
+    Args:
+        table: of the slots.
+        row: of a surface, or its phase.
+        place: name of the surface in messages.
+        suffix: of the format, for messages.
+        what: kind of surface in messages, where the same key is held of others.
+
+    Raises:
+        InputError: the row has a coefficient without a slot, or lacks what it must have.
+    """
+    slots = {number.key: slot for slot, number in table.items()}
+    given = [key for key in row if _TERM.fullmatch(key)]
+    for key in given:
+        if key not in slots:
+            held = [name for name in slots if _TERM.fullmatch(name)] or ["none"]
+            first = "x, y" if held[0] == "x" else held[0]
+            allowed = f"{first} to {held[-1]}" if len(held) > 1 else first
+            raise InputError(
+                f"{place}: a {suffix} file cannot hold '{key}'{what} (allowed: {allowed})"
+            )
+    found = {}
+    for key in dict.fromkeys((*given, *slots)):
+        number = table[slots[key]]
+        if key in row or number.rule:
+            found[slots[key]] = as_number(row.get(key, number.default), f"{place}: '{key}'")
+    return found
 
 
 _DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}

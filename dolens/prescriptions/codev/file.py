@@ -201,6 +201,10 @@ class Block:
     words: list[str]
     commands: dict[str, list[Command]] = field(default_factory=dict)
 
+    def said(self, key: str) -> list[str]:
+        """Return the arguments of the last command of a key; none where there is none."""
+        return self.commands[key][-1].words if key in self.commands else []
+
 
 @dataclass
 class CodeVFile:

@@ -74,7 +74,7 @@ class Axes:
                 axes at once.
         """
         for key in _OFFSETS:
-            if any(exact(word, f"{place}: {key}") for word in _words(block, key)):
+            if any(exact(word, f"{place}: {key}") for word in block.said(key)):
                 raise InputError(f"{place}: a tilt about a point of its own is not held ({key})")
         kinds = [key for key in _KINDS if key in block.commands]
         if len(kinds) > 1:
@@ -85,12 +85,12 @@ class Axes:
         self.shift_before = self.shift_after = Fraction(0)
         move: Break = {}
         for key, name in _SHIFTS.items():
-            value = scaled((_words(block, key) or ["0"])[0], factor, f"{place}: {key}")
+            value = scaled((block.said(key) or ["0"])[0], factor, f"{place}: {key}")
             move |= {name: value} if value else {}
         for key, (name, turned) in _TURNS.items():
-            value = scaled((_words(block, key) or ["0"])[0], Fraction(1), f"{place}: {key}")
+            value = scaled((block.said(key) or ["0"])[0], Fraction(1), f"{place}: {key}")
             move |= {name: -value if turned else value} if value else {}
-        along = exact((_words(block, "ZDE") or ["0"])[0], f"{place}: ZDE") * factor
+        along = exact((block.said("ZDE") or ["0"])[0], f"{place}: ZDE") * factor
         turns = {key: value for key, value in move.items() if key.startswith("tilt")}
         if self.kind != "REV":
             self.before, self.shift_before = _break(move), along
@@ -137,10 +137,6 @@ def _break(move: Break, order: str | None = None) -> Break | None:
     if not move:
         return None
     return {"type": "coordinate_break", **move, **({"order": order} if order else {})}
-
-
-def _words(block: Block, key: str) -> list[str]:
-    return block.commands[key][-1].words if key in block.commands else []
 
 
 def summed(first: Fraction, second: Fraction, place: str) -> float:

@@ -15,13 +15,13 @@ and `HOL` (a hole) are mechanical: CODE V draws them.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.xy_polynomial import monomial_powers
 from dolens.prescriptions.codev.file import Block, CodeVFile, unquoted
 from dolens.prescriptions.codev.glass import read_glass
 from dolens.prescriptions.numbers import (
@@ -32,15 +32,65 @@ from dolens.prescriptions.numbers import (
     radius_of,
     scaled,
 )
+from dolens.prescriptions.other_programs import (
+    ALWAYS,
+    Number,
+    Table,
+    monomials,
+    powers_of_r,
+    row_numbers,
+    slot_values,
+)
 
-_POWER = re.compile(r"a[1-9]\d*")
-_FORBES = re.compile(r"q[0-9]+")
+# Coefficients of an asphere, r⁴ to r²⁰.
+LETTERS = powers_of_r("ABCDEFGHJ", range(4, 21, 2))
+
+
+class Special(NamedTuple):
+    """A `Special` is a kind of special surface (SPS) that a prescription holds.
+
+    Attributes:
+        type: of a prescription's row.
+        table: slot (`SCO C4`) → key of the row.
+        curved: whether it has a radius of curvature.
+        what: it is called in messages.
+    """
+
+    type: str
+    table: Table
+    curved: bool = True
+    what: str = ""
+
+
+_CONIC = Number("conic", 0, ALWAYS, 0.0)
+# The order of the coefficients: Lens System Setup Reference Manual.
+SPECIALS = {
+    # Number 1, the conic constant, says nothing on a plane.
+    "XYP": Special(
+        "xy_polynomial",
+        {
+            f"SCO C{n}": Number(key, 1 - degree)
+            for n, (key, degree) in enumerate(monomials(10).items(), 2)
+        },
+        curved=False,
+    ),
+    "QBF": Special(
+        "q_bfs",
+        {
+            **{f"SCO C{n + 3}": Number(f"q{n}", 1) for n in range(97)},
+            "SCO C1": Number("normalization_radius", 1, ALWAYS),
+        },
+    ),
+    "ODD": Special(
+        "odd_asphere",
+        {"SCO C1": _CONIC, **powers_of_r((f"SCO C{n}" for n in range(2, 32)), range(1, 31))},
+        what=" of an odd asphere",
+    ),
+}
+# Of an odd asphere, a radius of normalisation; 0 means none.
+_ODD_NORM = "SCO C33"
+_PHASE = {f"HCO C{n}": Number(f"p{2 * n}", 1 - 2 * n) for n in range(1, 100)}
 _NUMBER = re.compile(r"C([1-9]\d?)")
-# Coefficients of x, y, x², ..., y¹⁰: number 1 is the conic constant.
-_XY_DEGREE = 10
-_HELD = ("XYP", "QBF", "ODD")
-_ODD_POWERS = 30
-_ODD_NORM = 33
 _ODD_NAME = re.compile(r"AR([1-9]\d?)")
 _NAMES = {
     "QCN": "a Forbes asphere (Q_con)",
@@ -69,39 +119,65 @@ def special_shape(
     Raises:
         InputError: the surface is of another kind, or a polynomial in x and y on a curved surface.
     """
-    words = block.commands["SPS"][-1].words
+    words = block.said("SPS")
     kind = words[0].upper() if words else ""
-    if kind not in _HELD:
+    if kind not in SPECIALS:
         what = _NAMES.get(kind, "a special surface")
         raise InputError(f"{place}: {what} is not held (SPS {kind})".rstrip())
     texts = _coefficients(block, "SCO", f"{place}: SCO", named=kind == "ODD")
-    if kind == "ODD":
-        return _odd(texts, words[1:], size, factor, place)
-    if kind == "QBF":
-        return _forbes(texts, size, factor, place)
-    if size:
+    special = SPECIALS[kind]
+    for word in (*words[1:], texts.pop(_ODD_NORM, "0")) if kind == "ODD" else ():
+        if number_in_text(word, f"{place}: SPS ODD") not in (0.0, 1.0):
+            raise InputError(
+                f"{place}: an odd asphere with a radius of normalisation is not held (SPS ODD "
+                f"{word})"
+            )
+    if size and not special.curved:
         raise InputError(
             f"{place}: a polynomial in x and y on a curved surface is not held (SPS XYP)"
         )
-    row: dict[str, Any] = {"type": "xy_polynomial"}
-    for number, text in sorted(texts.items()):
-        powers = xy_powers(number)
-        if number > 1 and powers is None and number_in_text(text, place):
-            raise InputError(f"{place}: SCO C{number} of SPS XYP is not held")
-        if number > 1 and powers is not None:
-            value = scaled(text, factor ** (1 - sum(powers)), f"{place}: SCO C{number}")
-            row |= {_monomial(*powers): value} if value or text == "0" else {}
-    return row
+    for slot, text in texts.items():
+        held = slot in special.table or (slot == "SCO C1" and not special.curved)
+        if not held and number_in_text(text, f"{place}: {slot}"):
+            raise InputError(f"{place}: {slot} of SPS {kind} is not held")
+    counts = _all_count if kind == "QBF" else _counts
+    found = row_numbers(special.table, texts, _units(factor), place, counts)
+    if kind == "QBF" and found["normalization_radius"] <= 0.0:
+        raise InputError(f"{place}: SPS QBF needs its radius of normalisation (SCO C1)")
+    return {"type": special.type, **(_given(size) if special.curved else {}), **found}
 
 
-def xy_powers(number: int) -> tuple[int, int] | None:
-    """Return the powers m of x and n of y of a coefficient: ((m + n)² + m + 3n)/2 + 1 = number."""
-    for degree in range(1, _XY_DEGREE + 1):
-        for n in range(degree + 1):
-            m = degree - n
-            if (degree * degree + m + 3 * n) // 2 + 1 == number:
-                return m, n
-    return None
+def special_lines(row: Mapping[str, Any], place: str) -> list[str]:
+    """Return the lines that `special_shape` reads back; nothing of another type.
+
+    Raises:
+        InputError: a coefficient has no place in CODE V's numbering.
+    """
+    kind = next((kind for kind, one in SPECIALS.items() if one.type == row["type"]), None)
+    if kind is None:
+        return []
+    special = SPECIALS[kind]
+    values = slot_values(special.table, row, place, ".seq", special.what)
+    ordered = sorted(values, key=lambda slot: int(slot.removeprefix("SCO C")))
+    return [f"  SPS {kind}", *number_lines({slot: values[slot] for slot in ordered})]
+
+
+def number_lines(values: Mapping[str, float]) -> list[str]:
+    """Return slots with their numbers; one that is zero is written without a point."""
+    return [f"  {slot} {value!r}" if value else f"  {slot} 0" for slot, value in values.items()]
+
+
+def _units(factor: Fraction) -> Callable[[str, Number], Fraction]:
+    return lambda slot, number: factor**number.power
+
+
+def _counts(text: str) -> bool:
+    """Return whether a coefficient says anything: a writer's zero has no point."""
+    return text == "0" or float(text) != 0.0
+
+
+def _all_count(text: str) -> bool:
+    return True
 
 
 def phase_row(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
@@ -112,134 +188,40 @@ def phase_row(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
     """
     if "DIF" not in block.commands:
         return {}
-    words = block.commands["DIF"][-1].words
-    form = [word.upper() for word in (_words_of(block, "HCT") or ["R"])]
+    words = block.said("DIF")
+    form = [word.upper() for word in (block.said("HCT") or ["R"])]
     if [word.upper() for word in words[:1]] != ["DOE"] or form != ["R"]:
         shown = " ".join([*words[:1], *form]).upper()
         raise InputError(
             f"{place}: a diffractive surface of this kind is not held (DIF {shown}; allowed: a "
             "radial phase, DIF DOE with HCT R)"
         )
-    order = number_in_text((_words_of(block, "HOR") or ["1"])[0], f"{place}: HOR")
+    order = number_in_text((block.said("HOR") or ["1"])[0], f"{place}: HOR")
     if order != int(order):
         raise InputError(f"{place}: HOR must be a whole number, not {order:g}")
-    waves = _words_of(block, "HWL")
+    waves = block.said("HWL")
     if not waves or number_in_text(waves[0], f"{place}: HWL") <= 0.0:
         raise InputError(f"{place}: the phase needs its wavelength (HWL, nm)")
     radians = 2.0 * math.pi / (float(waves[0]) * _NM)
-    row: dict[str, Any] = {"type": "radial", "order": int(order)}
-    for number, text in sorted(_coefficients(block, "HCO", f"{place}: HCO").items()):
-        value = scaled(text, factor ** (1 - 2 * number), f"{place}: HCO C{number}")
-        row[f"p{2 * number}"] = radians * value
-    return {"phase": row}
+    texts = _coefficients(block, "HCO", f"{place}: HCO")
+    paths = row_numbers(_PHASE, texts, _units(factor), place, _all_count)
+    phases = {key: radians * value for key, value in paths.items()}
+    return {"phase": {"type": "radial", "order": int(order), **phases}}
 
 
-def special_lines(row: Mapping[str, Any], place: str) -> list[str]:
-    """Return the lines that `special_shape` reads back; a coefficient that is zero has no point.
-
-    Raises:
-        InputError: a coefficient has no place in CODE V's numbering.
+def _coefficients(block: Block, key: str, place: str, named: bool = False) -> dict[str, str]:
+    """Return the texts of numbered coefficients by their slots; those of an odd asphere may have
+    names, too.
     """
-    if row["type"] == "q_bfs":
-        numbers = {1: row.get("normalization_radius")}
-        numbers |= {int(key[1:]) + 3: row[key] for key in row if _FORBES.fullmatch(key)}
-        return ["  SPS QBF", *_lines(numbers, place)]
-    if row["type"] == "odd_asphere":
-        powers = {int(key[1:]): row[key] for key in row if _POWER.fullmatch(key)}
-        if max(powers, default=0) > _ODD_POWERS:
-            raise InputError(
-                f"{place}: a .seq file cannot hold 'a{max(powers)}' of an odd asphere (allowed: a1 "
-                f"to a{_ODD_POWERS})"
-            )
-        numbers = {1: row.get("conic", 0.0)} | {n + 1: value for n, value in powers.items()}
-        return ["  SPS ODD", *_lines(numbers, place)]
-    known = {_monomial(*xy): n for n in range(2, 67) if (xy := xy_powers(n))}
-    numbers = {}
-    for key in row:
-        if monomial_powers(key) is None:
-            continue
-        if key not in known:
-            raise InputError(f"{place}: a .seq file cannot hold '{key}' (allowed: x, y to y10)")
-        numbers[known[key]] = row[key]
-    return ["  SPS XYP", *_lines(numbers, place)]
-
-
-def _lines(numbers: Mapping[int, Any], place: str) -> list[str]:
-    values = {n: as_number(value, place) for n, value in sorted(numbers.items())}
-    return [f"  SCO C{n} {value!r}" if value else f"  SCO C{n} 0" for n, value in values.items()]
-
-
-def _forbes(
-    texts: dict[int, str], size: dict[str, float], factor: Fraction, place: str
-) -> dict[str, Any]:
-    """Return Q_bfs: coefficient 1 is the radius of normalisation, 3 is q0, 4 is q1, ..."""
-    if number_in_text(texts.get(2, "0"), place):
-        raise InputError(f"{place}: SCO C2 of SPS QBF is not held")
-    radius = scaled(texts.get(1, "0"), factor, f"{place}: SCO C1")
-    if radius <= 0.0:
-        raise InputError(f"{place}: SPS QBF needs its radius of normalisation (SCO C1)")
-    row: dict[str, Any] = {"type": "q_bfs", **(size or {"radius": math.inf})}
-    for number, text in sorted(texts.items()):
-        if number > 2:
-            row[f"q{number - 3}"] = scaled(text, factor, f"{place}: SCO C{number}")
-    return row | {"normalization_radius": radius}
-
-
-def _odd(
-    texts: dict[int, str], words: list[str], size: dict[str, float], factor: Fraction, place: str
-) -> dict[str, Any]:
-    """Return the odd asphere: coefficient 1 is the conic constant, n + 1 that of rⁿ."""
-    for word in (*words, texts.get(_ODD_NORM, "0")):
-        if number_in_text(word, f"{place}: SPS ODD") not in (0.0, 1.0):
-            raise InputError(
-                f"{place}: an odd asphere with a radius of normalisation is not held (SPS ODD "
-                f"{word})"
-            )
-    row: dict[str, Any] = {"type": "odd_asphere", **(size or {"radius": math.inf})}
-    row["conic"] = number_in_text(texts.get(1, "0"), f"{place}: SCO C1")
-    for number, text in sorted(texts.items()):
-        power = number - 1
-        if number in (1, _ODD_NORM):
-            continue
-        if power > _ODD_POWERS:
-            raise InputError(f"{place}: SCO C{number} of SPS ODD is not held")
-        value = scaled(text, factor ** (1 - power), f"{place}: SCO C{number}")
-        row |= {f"a{power}": value} if value or text == "0" else {}
-    return row
-
-
-def _number(name: str, named: bool) -> int | None:
-    """Return the number of a coefficient; an odd asphere's may have names."""
-    match = _NUMBER.fullmatch(name)
-    if match is not None:
-        return int(match[1])
-    if named and name == "K":
-        return 1
-    match = _ODD_NAME.fullmatch(name) if named else None
-    return None if match is None else int(match[1]) + 1
-
-
-def _coefficients(block: Block, key: str, place: str, named: bool = False) -> dict[int, str]:
-    """Return the texts of numbered coefficients, which may be those that have names, too."""
-    found: dict[int, str] = {}
+    found: dict[str, str] = {}
     for command in block.commands.get(key, []):
-        number = _number(command.words[0].upper(), named) if command.words else None
-        if number is None or len(command.words) != 2:
+        name = command.words[0].upper() if command.words else ""
+        number, power = _NUMBER.fullmatch(name), _ODD_NAME.fullmatch(name) if named else None
+        if len(command.words) != 2 or not (number or power or (named and name == "K")):
             raise InputError(f"{place} (line {command.at}): expected a coefficient, as C4 0.1")
-        found[number] = command.words[1]
+        n = int(number[1]) if number else int(power[1]) + 1 if power else 1
+        found[f"{key} C{n}"] = command.words[1]
     return found
-
-
-def _monomial(m: int, n: int) -> str:
-    return "".join(
-        letter + (str(power) if power > 1 else "")
-        for letter, power in (("x", m), ("y", n))
-        if power
-    )
-
-
-def _words_of(block: Block, key: str) -> list[str]:
-    return block.commands[key][-1].words if key in block.commands else []
 
 
 # Commands of an outline → what a prescription calls them.
@@ -359,8 +341,6 @@ def _text(value: object, place: str) -> str:
     return repr(as_number(value, place))
 
 
-# Coefficients of r⁴, r⁶, ..., r²⁰.
-_COEFFICIENTS = {key: 2 * i for i, key in enumerate("ABCDEFGHJ", 2)}
 _MIRRORS = ("REFL",)
 _REFRACTS = ("REFR", "AIR", "")
 
@@ -437,21 +417,20 @@ def object_shape(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
 
 def shape_is_given(block: Block) -> bool:
     """Return whether a block names a shape or coefficients."""
-    return any(key in block.commands for key in ("SPH", "CON", "ASP", "K", "SPS", *_COEFFICIENTS))
+    return any(key in block.commands for key in ("SPH", "CON", "ASP", "K", "SPS", *LETTERS))
 
 
 def conic_constant(block: Block, place: str) -> float:
     """Return the conic constant of a block, zero where it names none."""
-    return number_in_text((_words(block, "K") or ["0"])[0], f"{place}: K")
+    return number_in_text((block.said("K") or ["0"])[0], f"{place}: K")
 
 
 def _curvature(block: Block, factor: Fraction, place: str) -> dict[str, float]:
     """Read the first number of S, or RDY or CUY; zero is a plane."""
     if _numeric(block, "CUY"):
-        value = scaled(_words(block, "CUY")[0], 1 / factor, f"{place}: CUY")
-        return _curvature_row(value)
+        return _curvature_row(scaled(_value(block, "CUY", 0), 1 / factor, f"{place}: CUY"))
     if _numeric(block, "RDY"):
-        return _radius_row(_words(block, "RDY")[0], factor, place)
+        return _radius_row(_value(block, "RDY", 0), factor, place)
     word = block.words[0] if block.words else "0"
     if word.lower() in ("inf", "infinity"):
         return {}
@@ -482,11 +461,11 @@ def _shape(
     block: Block, size: dict[str, float], aperture: bool, factor: Fraction, place: str
 ) -> dict[str, Any]:
     """Return type, radius, conic constant and coefficients."""
-    if any(exact(word, f"{place}: CUF") for word in _words(block, "CUF")):
+    if any(exact(word, f"{place}: CUF") for word in block.said("CUF")):
         raise InputError(f"{place}: a Fresnel surface is not held (CUF)")
     if "SPS" in block.commands:
         return special_shape(block, size, factor, place)
-    if "ASP" in block.commands or any(key in block.commands for key in _COEFFICIENTS):
+    if "ASP" in block.commands or any(key in block.commands for key in LETTERS):
         conic = {"conic": conic_constant(block, place)}
         return {"type": "even_asphere", **_given(size), **conic} | _powers(block, factor, place)
     if "CON" in block.commands or "K" in block.commands:
@@ -506,23 +485,19 @@ def _powers(block: Block, factor: Fraction, place: str) -> dict[str, float]:
     CODE V lists `C 0.0; D 0.0` that nobody uses: zeros with a point behind the last coefficient
     that is used are left out.
     """
-    found: dict[str, float] = {}
-    used = 0
-    for key, power in _COEFFICIENTS.items():
-        words = _words(block, key)
-        if words:
-            value = scaled(words[0], factor ** (1 - power), f"{place}: {key}")
-            found[f"a{power}"] = value
-            used = power if value or words[0] == "0" else used
-    return {name: value for name, value in found.items() if int(name[1:]) <= used}
+    words = {key: block.said(key)[0] for key in LETTERS if block.said(key)}
+    found = row_numbers(LETTERS, words, _units(factor), place, _all_count)
+    used = max((n for n, key in enumerate(LETTERS) if _counts(words.get(key, "0.0"))), default=-1)
+    kept = [number.key for number in islice(LETTERS.values(), used + 1)]
+    return {key: found[key] for key in kept if key in found}
 
 
 def _material(
     block: Block, file: CodeVFile, before: str, used: tuple[float, float], place: str
 ) -> str:
     """Return the medium behind a surface, or `mirror`."""
-    words = _words(block, "GLA") or block.words[2:3]
-    mode = (_words(block, "RMD") or block.words[3:4] or [""])[0].upper()
+    words = block.said("GLA") or block.words[2:3]
+    mode = (block.said("RMD") or block.words[3:4] or [""])[0].upper()
     glass = unquoted(words[0]) if words else ""
     if glass.upper() in _MIRRORS:
         glass, mode = "", glass.upper()
@@ -554,9 +529,3 @@ def _numeric(block: Block, key: str) -> bool:
 
 def _is_number(words: list[str]) -> bool:
     return bool(words) and words[0][:1] in set("+-.0123456789")
-
-
-def _words(block: Block, key: str) -> list[str]:
-    if key in ("CUY", "RDY") and key in block.commands:
-        return next(c.words for c in reversed(block.commands[key]) if _is_number(c.words))
-    return block.commands[key][-1].words if key in block.commands else []

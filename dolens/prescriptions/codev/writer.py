@@ -1,7 +1,6 @@
 """A prescription is written as the text of a CODE V `.seq` file."""
 
 import math
-import re
 from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
@@ -10,21 +9,25 @@ from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.codev.glass import glass_word, private_glass
 from dolens.prescriptions.codev.reader import break_words, read_codev
-from dolens.prescriptions.codev.surface import aperture_lines, special_lines
+from dolens.prescriptions.codev.surface import (
+    LETTERS,
+    SPECIALS,
+    aperture_lines,
+    number_lines,
+    special_lines,
+)
 from dolens.prescriptions.numbers import as_integer, as_number
-from dolens.prescriptions.other_programs import require_same
+from dolens.prescriptions.other_programs import require_same, slot_values
 from dolens.prescriptions.row_data import canonical_digits
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 _TYPES = (
-    *("plane", "aperture", "sphere", "conic", "even_asphere", "xy_polynomial", "q_bfs"),
-    "odd_asphere",
+    *("plane", "aperture", "sphere", "conic", "even_asphere"),
+    *(special.type for special in SPECIALS.values()),
     "coordinate_break",
 )
 _D_LINE = 587.5618
 _INFINITY = "1e13"
-_POWER = re.compile(r"a(\d+)")
-_LETTERS = dict(zip(range(4, 22, 2), "ABCDEFGHJ", strict=True))
 _FIELDS = {"angles": "AN", "heights": "OB", "image_heights": "IM", "real_image_heights": "RI"}
 _PUPILS = {
     "entrance_pupil_diameter": "EPD",
@@ -194,24 +197,9 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
     if kind in ("conic", "even_asphere"):
         asphere = ["  ASP"] if kind == "even_asphere" else []
         lines += [*asphere, f"  K {_text(row.get('conic', 0.0), place)}"]
-        lines += _coefficients(row, place)
-    if kind in ("xy_polynomial", "q_bfs", "odd_asphere"):
-        lines += special_lines(row, place)
+        lines += number_lines(slot_values(LETTERS, row, place, ".seq"))
+    lines += special_lines({**row, "type": kind}, place)
     return lines + aperture_lines(row, place)
-
-
-def _coefficients(row: Mapping[str, Any], place: str) -> list[str]:
-    lines = []
-    for key in row:
-        power = _POWER.fullmatch(key)
-        if power is None:
-            continue
-        letter = _LETTERS.get(int(power[1]))
-        if letter is None:
-            raise InputError(f"{place}: a .seq file cannot hold '{key}' (allowed: a4 to a20)")
-        value = as_number(row[key], f"{place}: '{key}'")
-        lines.append(f"  {letter} {value!r}" if value else f"  {letter} 0")
-    return lines
 
 
 def _image(sensor: Mapping[str, Any], where: str) -> list[str]:

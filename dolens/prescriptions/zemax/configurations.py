@@ -277,7 +277,7 @@ def _of_configuration(
 
 
 def _refuse_other_structure(lens: dict[str, Any], there: dict[str, Any]) -> None:
-    for key in (lens.keys() | there.keys()) - {"surfaces", "sensor", *_KEYS}:
+    for key in sorted((lens.keys() | there.keys()) - {"surfaces", "sensor", *_KEYS}):
         if lens.get(key) != there.get(key):
             raise InputError(f"it changes '{key}'")
     if lens["surfaces"].keys() != there["surfaces"].keys():
@@ -286,7 +286,7 @@ def _refuse_other_structure(lens: dict[str, Any], there: dict[str, Any]) -> None
         for key in ("type", "material", "phase"):
             if row.get(key) != there["surfaces"][n].get(key):
                 raise InputError(f"surface {n}: it changes '{key}'")
-    for key in (lens["sensor"].keys() | there["sensor"].keys()) - {"distance"}:
+    for key in sorted((lens["sensor"].keys() | there["sensor"].keys()) - {"distance"}):
         if lens["sensor"].get(key) != there["sensor"].get(key):
             raise InputError(f"the image: it changes '{key}'")
 

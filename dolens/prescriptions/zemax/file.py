@@ -205,37 +205,28 @@ class SurfaceBlock:
         return self.length("CURV", -1)
 
     @cached_property
-    def parameters(self) -> dict[int, str]:
-        """Return the numbers of PARM as they are written, by their own numbers."""
-        return self._numbered("PARM")
-
-    @cached_property
-    def extra_data(self) -> dict[int, str]:
-        """Return the numbers of XDAT as they are written, by their own numbers."""
-        return self._numbered("XDAT")
-
-    def parameter(self, n: int, power: int = 0) -> float:
-        """Return PARM n, a length to a power, in mm^power; 0 where the file does not give it."""
-        return scaled(self.parameters.get(n, "0"), self.factor**power, f"{self.place}: PARM {n}")
-
-    def extra(self, n: int, power: int = 0) -> float:
-        """Return XDAT n, a length to a power, in mm^power; 0 where the file does not give it."""
-        return scaled(self.extra_data.get(n, "0"), self.factor**power, f"{self.place}: XDAT {n}")
-
-    def _numbered(self, operand: str) -> dict[int, str]:
+    def slots(self) -> dict[str, str]:
+        """Return the numbers of PARM and XDAT as they are written, by slot: `PARM 2`, `XDAT 3`."""
         found = {}
-        for line in self.lines.get(operand, []):
-            what = f"{self.place}: {operand} (line {line.at})"
-            if len(line.arguments) < 2:
-                raise InputError(f"{what}: needs a number from 1 and a value")
-            n = number_in_text(line.arguments[0], what)
-            if n < 0 or n != int(n):
-                raise InputError(
-                    f"{what}: must have a whole number from 0, not {line.arguments[0]}"
-                )
-            number_in_text(line.arguments[1], what)
-            found[int(n)] = line.arguments[1]
+        for operand in ("PARM", "XDAT"):
+            for line in self.lines.get(operand, []):
+                what = f"{self.place}: {operand} (line {line.at})"
+                if len(line.arguments) < 2:
+                    raise InputError(f"{what}: needs a number from 1 and a value")
+                n = number_in_text(line.arguments[0], what)
+                if n < 0 or n != int(n):
+                    raise InputError(
+                        f"{what}: must have a whole number from 0, not {line.arguments[0]}"
+                    )
+                number_in_text(line.arguments[1], what)
+                found[f"{operand} {int(n)}"] = line.arguments[1]
         return found
+
+    def slot(self, name: str, power: int = 0) -> float:
+        """Return a number of PARM or XDAT, a length to a power, in mm^power; 0 where the file does
+        not give it.
+        """
+        return scaled(self.slots.get(name, "0"), self.factor**power, f"{self.place}: {name}")
 
 
 def curvature_row(curvature: float) -> dict[str, float]:

@@ -11,7 +11,7 @@ from dolens.errors import InputError
 from dolens.prescriptions.numbers import number_in_text
 from dolens.prescriptions.zemax.configurations import configuration_lines
 from dolens.prescriptions.zemax.file import Line, ZemaxFile
-from dolens.prescriptions.zemax_standard import JONES_MATRIX
+from dolens.prescriptions.zemax.shapes import JONES_MATRIX
 
 _SOLVES = "variables and solves, whose results are written"
 _DRAWING = "drawing and colours"

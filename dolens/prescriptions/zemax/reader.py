@@ -59,9 +59,9 @@ from dolens.prescriptions.zemax.file import (
 )
 from dolens.prescriptions.zemax.glass import read_glass
 from dolens.prescriptions.zemax.passed_over import passed_over
+from dolens.prescriptions.zemax.shapes import shape_of_block
 from dolens.prescriptions.zemax.system import factor_to_mm, read_system
-from dolens.prescriptions.zemax_shape import Row
-from dolens.prescriptions.zemax_shapes import shape_of_block
+from dolens.prescriptions.zemax.table import Row
 
 _BEFORE, _AFTER, _RETURN = "1", "2", "3"
 _SAME, _REVERSED = 1.0, 2.0
@@ -332,7 +332,9 @@ def _image_shape(block: SurfaceBlock) -> dict[str, float]:
             f"{block.place}: an image of this shape is not held (TYPE {block.type}; allowed: "
             "a plane, sphere or conic)"
         )
-    if block.type == "EVENASPH" and any(float(word) for word in block.parameters.values()):
+    if block.type == "EVENASPH" and any(
+        float(word) for slot, word in block.slots.items() if slot[:4] == "PARM"
+    ):
         raise InputError(f"{block.place}: an aspheric image is not held (allowed: a conic)")
     if block.curvature == 0.0:
         return {}

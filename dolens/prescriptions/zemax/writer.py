@@ -26,9 +26,9 @@ from dolens.prescriptions.zemax.configurations import (
 from dolens.prescriptions.zemax.file import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax.glass import catalogue_line, glass_line
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.shapes import shape_of_row
 from dolens.prescriptions.zemax.system import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
-from dolens.prescriptions.zemax_shapes import shape_of_row
-from dolens.prescriptions.zemax_standard import conic_line, curvature_line
+from dolens.prescriptions.zemax.table import conic_line, curvature_line
 
 _BY_LINE = {line: operand for operand, line in OF_SURFACES.items()}
 _BY_PLACE = {place: operand for operand, place in OF_APERTURES.items()}
@@ -107,7 +107,7 @@ def configurations_of(
 def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, str]:
     """Return the numbers in which a file differs from another."""
     found: dict[Setting, str] = {}
-    for operand in base.system.keys() | file.system.keys():
+    for operand in dict.fromkeys((*base.system, *file.system)):
         before, after = _last(base.system, operand), _last(file.system, operand)
         if operand == "WAVM":
             # As many in both, or FTYP differs.
@@ -122,7 +122,7 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
             for n, (old, new) in enumerate(zip(before, after, strict=True), 1):
                 if old != new:
                     found[Setting(_BY_LIST[operand], n)] = new
-        elif operand in ("ENPD", "FNUM", "OBNA") and before[1:] == after[1:]:
+        elif operand in ("ENPD", "FNUM", "OBNA") and before and after and before[1:] == after[1:]:
             found[Setting("APER", 0)] = after[0]
         elif operand == "FTYP" and before[0] != after[0]:
             raise InputError(f"{place}: a .zmx file has fields of one kind in all its states")
@@ -141,14 +141,14 @@ def _of_surface(
     n: int, before: dict[str, list[Line]], after: dict[str, list[Line]], place: str
 ) -> dict[Setting, str]:
     found: dict[Setting, str] = {}
-    for operand in before.keys() | after.keys():
+    for operand in dict.fromkeys((*before, *after)):
         one, other = _last(before, operand), _last(after, operand)
         if operand == "PARM":
             numbers = [
                 {line.arguments[0]: line.arguments[1] for line in lines.get(operand, [])}
                 for lines in (before, after)
             ]
-            for key in numbers[0].keys() | numbers[1].keys():
+            for key in dict.fromkeys((*numbers[0], *numbers[1])):
                 if numbers[0].get(key) != numbers[1].get(key):
                     found[Setting("PRAM", n, int(key))] = numbers[1].get(key, "0.0")
         elif one == other:
