@@ -15,7 +15,7 @@ from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
 from dolens.prescriptions.numbers import as_number, radius_of
 from dolens.prescriptions.other_programs import ReadPrescription, paraxial_image
-from dolens.prescriptions.plain_values import difference, mapping, number, rows
+from dolens.prescriptions.plain_values import difference, even_powers, mapping, number, rows
 
 _STOPS = ("Aperture", "Stop")
 _NOT_HELD = {
@@ -149,7 +149,7 @@ def _row(surface: dict[str, Any], before: str, place: str) -> dict[str, Any]:
         row = {"type": "sphere", **_curvature(surface, place)}
         if kind == "Aspheric":
             row |= {"type": "even_asphere", "conic": number(surface, "k", place, 0.0)}
-            row |= _coefficients(surface, place)
+            row |= even_powers(surface, "ai", place, 1 if surface.get("use_ai2", True) else 2)
     else:
         what = _NOT_HELD.get(kind, f"type '{kind}'")
         raise InputError(
@@ -209,17 +209,6 @@ def _vector(surface: dict[str, Any], key: str, count: int, place: str) -> list[f
     if len(values) != count:
         raise InputError(f"{place}: '{key}' must be a list of {count} numbers")
     return [as_number(value, f"{place}: '{key}'") for value in values]
-
-
-def _coefficients(surface: dict[str, Any], place: str) -> dict[str, float]:
-    """Return a2 (where it is not zero), a4, ... of the list `ai`."""
-    values = rows(surface.get("ai", []), f"{place}: 'ai'")
-    numbers = [as_number(value, f"{place}: 'ai'") for value in values]
-    first = 1 if surface.get("use_ai2", True) else 2
-    found = {f"a{2 * i}": value for i, value in enumerate(numbers, first)}
-    if not found.get("a2"):
-        found.pop("a2", None)
-    return found
 
 
 def _sensor(

@@ -13,15 +13,24 @@ from dolens.errors import InputError
 from dolens.file_text import decode_text, much_at_once, without_controls
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
+from dolens.prescriptions.deeplens_json import read_deeplens
 from dolens.prescriptions.diffoptics_text import (
     diffoptics_text_of,
     object_radius,
     prescription_from_diffoptics,
 )
-from dolens.prescriptions.json_lenses import json_of, read_json
+from dolens.prescriptions.optiland_json import read_optiland
 from dolens.prescriptions.oslo import read_oslo
 from dolens.prescriptions.other_programs import ReadPrescription, curved_object
-from dolens.prescriptions.plain_values import read_yaml, yaml_of
+from dolens.prescriptions.plain_values import (
+    Watched,
+    json_content,
+    json_of,
+    passed_over,
+    read_yaml,
+    yaml_of,
+)
+from dolens.prescriptions.ray_optics_json import read_ray_optics
 from dolens.prescriptions.zemax.file import encode_zemax
 from dolens.prescriptions.zemax.reader import read_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
@@ -29,6 +38,8 @@ from dolens.prescriptions.zemax.writer import zemax_of
 # A lens is text of some kilobytes; more is no lens.
 MOST_BYTES = 64 * 2**20
 _LOOKED_AT = 65536
+
+_JsonReader = Callable[[dict[str, Any], str], ReadPrescription]
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,42 @@ def _read_diffoptics(text: str, where: str) -> ReadPrescription:
     radius = object_radius(text, where)
     return ReadPrescription(
         prescription, curved_object(prescription, {"radius": radius}, f"{where}: the object")
+    )
+
+
+def _is_deeplens(content: dict[str, Any]) -> bool:
+    surfaces = content.get("surfaces")
+    if not isinstance(surfaces, list) or not surfaces or not isinstance(surfaces[0], dict):
+        return False
+    return "type" in surfaces[0] and any("d_next" in s for s in surfaces if isinstance(s, dict))
+
+
+# Programs that write JSON, as the keys of their files tell.
+_JSON_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], _JsonReader], ...] = (
+    (lambda content: "surface_group" in content, read_optiland),
+    (_is_deeplens, read_deeplens),
+    (lambda content: "optical_model" in content, read_ray_optics),
+)
+
+
+def read_json(text: str, where: str) -> ReadPrescription:
+    """Read a lens in JSON: dolens's own prescription, or a file of another program.
+
+    Raises:
+        InputError: it is not valid JSON, a key is given twice, or no known program wrote it.
+    """
+    content = json_content(text, where)
+    if isinstance(content.get("surfaces"), dict):
+        return ReadPrescription(content, [])
+    for holds, read in _JSON_READERS:
+        if holds(content):
+            watched = Watched(content)
+            prescription, more = read(watched, where)
+            return ReadPrescription(prescription, [*more, *passed_over(watched)])
+    keys = ", ".join(list(content)[:5]) or "none"
+    raise InputError(
+        f"{where}: no program that is known here writes lenses with the keys {keys} (allowed: "
+        "prescriptions of dolens, and files of Optiland, DeepLens and ray-optics)"
     )
 
 

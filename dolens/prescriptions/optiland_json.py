@@ -16,7 +16,14 @@ from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.numbers import as_number, as_numbers
 from dolens.prescriptions.other_programs import ReadPrescription, curved_object
-from dolens.prescriptions.plain_values import difference, mapping, number, require_unset, rows
+from dolens.prescriptions.plain_values import (
+    difference,
+    even_powers,
+    mapping,
+    number,
+    require_unset,
+    rows,
+)
 from dolens.prescriptions.system_data import unequal_weights
 
 _FIELDS = {
@@ -145,20 +152,10 @@ def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
     if kind == "StandardGeometry":
         if math.isinf(radius) and not conic:
             return {"type": "plane"}
-        return (
-            {"type": "conic", "radius": radius, "conic": conic}
-            if conic
-            else {
-                "type": "sphere",
-                "radius": radius,
-            }
-        )
+        shape = {"type": "conic" if conic else "sphere", "radius": radius}
+        return shape | ({"conic": conic} if conic else {})
     if kind == "EvenAsphere":
-        values = rows(geometry.get("coefficients", []), f"{place}: 'coefficients'")
-        numbers = [as_number(value, f"{place}: 'coefficients'") for value in values]
-        terms = {f"a{2 * i}": value for i, value in enumerate(numbers, 1)}
-        if not terms.get("a2"):
-            terms.pop("a2", None)
+        terms = even_powers(geometry, "coefficients", place)
         return {"type": "even_asphere", "radius": radius, "conic": conic, **terms}
     raise InputError(
         f"{place}: a surface of shape {kind!r} is not held "

@@ -1,6 +1,9 @@
 """Lens files in YAML and JSON are plain values: every key once, nothing that names code."""
 
+import json
+import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
@@ -168,6 +171,83 @@ def yaml_of(prescription: Mapping[str, Any], where: str) -> bytes:
     return text.encode()
 
 
+def json_content(text: str, where: str) -> dict[str, Any]:
+    """Read the mapping that JSON holds.
+
+    Numbers are the nearest doubles of their decimals; an infinite number is `Infinity`, as some
+    programs write it, or the text `"inf"`, as dolens does.
+
+    Raises:
+        InputError: it is not valid JSON, a key is given twice, or it holds something else.
+    """
+    content = _json(text, where)
+    if not isinstance(content, dict):
+        kinds = {list: "a list", str: "a text", type(None): "nothing", bool: "a truth value"}
+        kind = kinds.get(type(content), "a number")
+        raise InputError(f"{where}: expected a mapping of keys to values, not {kind}")
+    return content
+
+
+def _json(text: str, where: str) -> Any:
+    try:
+        content = json.loads(
+            text,
+            object_pairs_hook=_each_key_once,
+            parse_int=lambda text: _short(text, int),
+            parse_float=lambda text: _short(text, float),
+        )
+        level = [content]
+        for _ in range(_DEEPEST):
+            level = [entry for value in level for entry in _entries(value)]
+        if level:
+            raise RecursionError
+        if "\\u" in text:
+            json.dumps(content, ensure_ascii=False).encode()  # raises at half of a surrogate pair
+        return content
+    except RecursionError:
+        raise InputError(f"{where}: is not valid JSON (it is nested too deeply)") from None
+    except ValueError as error:
+        raise InputError(f"{where}: is not valid JSON ({error})") from None
+
+
+def _entries(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        twice = next(key for key in counts if counts[key] > 1)
+        raise ValueError(f"key '{twice}' is given twice")
+    return found
+
+
+def _short(text: str, kind: type[int] | type[float]) -> int | float:
+    if len(text) > _LONGEST_NUMBER:
+        raise ValueError(f"a number of {len(text)} letters")
+    return kind(text)
+
+
+def json_of(prescription: Mapping[str, Any], where: str) -> bytes:
+    """Write a prescription as JSON, with the keys that YAML has; reading gives the same bits."""
+    text = json.dumps(_finite(prescription), indent=2, ensure_ascii=False, allow_nan=False)
+    return f"{text}\n".encode()
+
+
+def _finite(value: Any) -> Any:
+    """Return plain values that JSON can hold: infinities become texts."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0.0 else "-inf"
+    return value
+
+
 class Watched(dict[str, Any]):
     """A `Watched` is a mapping that remembers which of its keys were looked up.
 
@@ -249,6 +329,23 @@ def number(content: dict[str, Any], key: str, place: str, default: float | None 
             raise InputError(f"{place}: '{key}' is missing")
         return default
     return as_number(content[key], f"{place}: '{key}'")
+
+
+def even_powers(content: dict[str, Any], key: str, place: str, first: int = 1) -> dict[str, float]:
+    """Return the coefficients of r² (where it is not zero), r⁴, ... in a list of numbers.
+
+    Args:
+        content: of a surface.
+        key: of the list; nothing where there is none.
+        place: name of the surface in messages.
+        first: 2 where the list begins at r⁴.
+    """
+    values = rows(content.get(key, []), f"{place}: '{key}'")
+    numbers = [as_number(value, f"{place}: '{key}'") for value in values]
+    found = {f"a{2 * n}": value for n, value in enumerate(numbers, first)}
+    if not found.get("a2"):
+        found.pop("a2", None)
+    return found
 
 
 def difference(later: float, earlier: float, place: str) -> float:

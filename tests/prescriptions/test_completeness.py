@@ -22,8 +22,7 @@ from dolens.prescriptions.build import (
     lens_from_prescription,
     prescription_of,
 )
-from dolens.prescriptions.json_lenses import read_json
-from dolens.prescriptions.lens_formats import read_lens
+from dolens.prescriptions.lens_formats import read_json, read_lens
 from dolens.prescriptions.other_programs import ReadPrescription
 from dolens.prescriptions.plain_values import plain_values
 from dolens.prescriptions.row_data import SENSOR_KEYS
