@@ -13,7 +13,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
-from dolens.prescriptions.numbers import as_number, radius_of
+from dolens.prescriptions.numbers import as_number, radius_row
 from dolens.prescriptions.other_programs import ReadPrescription, paraxial_image
 from dolens.prescriptions.plain_values import difference, even_powers, mapping, number, rows
 
@@ -175,9 +175,7 @@ def _curvature(surface: dict[str, Any], place: str) -> dict[str, float]:
     if surface.get("roc") is not None:
         radius = as_number(surface["roc"], f"{place}: 'roc'")
         return {"radius": radius or math.inf}
-    curvature = number(surface, "c", place)
-    exact = radius_of(curvature)
-    return {"curvature": curvature} if exact is None else {"radius": exact}
+    return radius_row(number(surface, "c", place))
 
 
 def _pose(surface: dict[str, Any], place: str) -> dict[str, float]:

@@ -230,8 +230,8 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
     if not values:
         return {}
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}
-    weighed = unequal_weights(weights, len(values), f"{where}: weights of the wavelengths")
-    return found | ({"wavelength_weights": weighed} if weighed else {})
+    place = f"{where}: weights of the wavelengths"
+    return found | unequal_weights("wavelength_weights", weights, len(values), place)
 
 
 def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -258,10 +258,8 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     if any(any(pair) for pair in cut):
         found["vignetting"] = [{"compression_x": x, "compression_y": y} for x, y in cut]
     weights = [number(e, "weight", where, 1.0) for e in entries]
-    weighed = unequal_weights(weights, len(points), f"{where}: weights of the fields")
-    if weighed:
-        found["weights"] = weighed
-    return {"fields": found}
+    place = f"{where}: weights of the fields"
+    return {"fields": found | unequal_weights("weights", weights, len(points), place)}
 
 
 _DEFINITIONS = {

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
-from dolens.prescriptions.numbers import exact, nearest, number_in_text, radius_of, scaled
+from dolens.prescriptions.numbers import exact, nearest, number_in_text, radius_row, scaled
 from dolens.prescriptions.other_programs import ReadPrescription, curved_object
 from dolens.prescriptions.system_data import unequal_weights
 
@@ -224,9 +224,7 @@ def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[
         require_wavelengths(values, f"{where}: WV", "µm")
         found |= {"wavelengths": values, "reference_wavelength": values[0]}
         weights = [number_in_text(w, f"{where}: WW") for w in _words(file.system, "WW")]
-        weighed = unequal_weights(weights, len(values), f"{where}: WW")
-        if weighed:
-            found["wavelength_weights"] = weighed
+        found |= unequal_weights("wavelength_weights", weights, len(values), f"{where}: WW")
     for command, key, usual in (("TEM", "temperature", 20.0), ("PRE", "pressure", 1.0)):
         words = _words(file.system, command)
         if words and number_in_text(words[0], f"{where}: {command}") != usual:
@@ -311,10 +309,7 @@ def _size(block: Block, factor: Fraction, place: str) -> dict[str, float]:
         radius = scaled((_words(block, "RD") or ["0"])[0], factor, f"{place}: RD")
         return {"radius": radius} if radius else {}
     curvature = scaled((_words(block, "CV") or ["0"])[0], 1 / factor, f"{place}: CV")
-    if not curvature:
-        return {}
-    radius_or_none = radius_of(curvature)
-    return {"curvature": curvature} if radius_or_none is None else {"radius": radius_or_none}
+    return radius_row(curvature) if curvature else {}
 
 
 def _curved(image: Block, factor: Fraction, place: str) -> dict[str, float]:

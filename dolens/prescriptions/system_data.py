@@ -326,19 +326,21 @@ def weights_from(value: Any, count: int, place: str) -> list[float]:
     return found
 
 
-def unequal_weights(values: Sequence[float], count: int, place: str) -> list[float] | None:
-    """Return the weights that a file gives its first `count` wavelengths or fields; None where it
-    gives none, or all are the same.
+def unequal_weights(
+    key: str, values: Sequence[float], count: int, place: str
+) -> dict[str, list[float]]:
+    """Return the weights, under a key, that a file gives its first `count` wavelengths or fields;
+    nothing where it gives none, or all are the same.
 
     Raises:
         InputError: too few, a negative one, or zeros alone; the message begins with the place.
     """
     if not values:
-        return None
+        return {}
     if len(values) < count:
         raise InputError(f"{place} gives {len(values)} weights for {count}")
     found = weights_from(list(values[:count]), count, place)
-    return found if len(set(found)) > 1 else None
+    return {key: found} if len(set(found)) > 1 else {}
 
 
 def field_rows(fields: Fields) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from dolens.prescriptions.numbers import (
     curvature_in_text,
     exact,
     number_in_text,
-    radius_of,
+    radius_row,
     scaled,
 )
 from dolens.prescriptions.other_programs import (
@@ -393,7 +393,7 @@ def read_surface(
     """
     material = _material(block, file, before, used, place)
     medium = before if material == "mirror" else material
-    size = _curvature(block, factor, place)
+    size = curvature_row(block, factor, place)
     phase = phase_row(block, factor, place)
     row = _shape(block, size, stop and material == before and not phase, factor, place) | phase
     slb = block.commands.get("SLB")
@@ -405,14 +405,9 @@ def read_surface(
     return Surface(row, curvature, gap, material, medium, stop, label)
 
 
-def curvature_row(block: Block, factor: Fraction, place: str) -> dict[str, float]:
-    """Return radius or curvature as a prescription's row has it; empty for a plane."""
-    return _curvature(block, factor, place)
-
-
 def object_shape(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
     """Return the shape of an object as a prescription's row has it."""
-    return _shape(block, _curvature(block, factor, place), False, factor, place)
+    return _shape(block, curvature_row(block, factor, place), False, factor, place)
 
 
 def shape_is_given(block: Block) -> bool:
@@ -425,10 +420,11 @@ def conic_constant(block: Block, place: str) -> float:
     return number_in_text((block.said("K") or ["0"])[0], f"{place}: K")
 
 
-def _curvature(block: Block, factor: Fraction, place: str) -> dict[str, float]:
-    """Read the first number of S, or RDY or CUY; zero is a plane."""
+def curvature_row(block: Block, factor: Fraction, place: str) -> dict[str, float]:
+    """Read radius or curvature: the first number of S, or RDY or CUY; nothing of a plane."""
     if _numeric(block, "CUY"):
-        return _curvature_row(scaled(_value(block, "CUY", 0), 1 / factor, f"{place}: CUY"))
+        value = scaled(_value(block, "CUY", 0), 1 / factor, f"{place}: CUY")
+        return radius_row(value) if value else {}
     if _numeric(block, "RDY"):
         return _radius_row(_value(block, "RDY", 0), factor, place)
     word = block.words[0] if block.words else "0"
@@ -436,7 +432,8 @@ def _curvature(block: Block, factor: Fraction, place: str) -> dict[str, float]:
         return {}
     if block.radii:
         return _radius_row(word, factor, place)
-    return _curvature_row(scaled(word, 1 / factor, f"{place}: curvature"))
+    value = scaled(word, 1 / factor, f"{place}: curvature")
+    return radius_row(value) if value else {}
 
 
 def _radius_row(word: str, factor: Fraction, place: str) -> dict[str, float]:
@@ -448,13 +445,6 @@ def _radius_row(word: str, factor: Fraction, place: str) -> dict[str, float]:
         if curvature is not None:
             return {"curvature": curvature}
     return {"radius": radius}
-
-
-def _curvature_row(value: float) -> dict[str, float]:
-    if value == 0.0:
-        return {}
-    radius = radius_of(value)
-    return {"curvature": value} if radius is None else {"radius": radius}
 
 
 def _shape(

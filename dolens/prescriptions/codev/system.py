@@ -73,12 +73,8 @@ def _wavelengths(file: CodeVFile, where: str) -> dict[str, Any]:
     if not 1 <= number <= len(values):
         raise InputError(f"{where}: REF {number} is none of the wavelengths 1 to {len(values)}")
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": values[number - 1]}
-    weights = unequal_weights(
-        _numbers(file, "WTW", Fraction(1), where), len(values), f"{where}: WTW"
-    )
-    if weights:
-        found["wavelength_weights"] = weights
-    return found
+    weights = _numbers(file, "WTW", Fraction(1), where)
+    return found | unequal_weights("wavelength_weights", weights, len(values), f"{where}: WTW")
 
 
 def _fields(file: CodeVFile, factor: Fraction, where: str) -> dict[str, Any]:
@@ -95,9 +91,8 @@ def _fields(file: CodeVFile, factor: Fraction, where: str) -> dict[str, Any]:
     count = max(len(x), len(y))
     x, y = (values + [0.0] * (count - len(values)) for values in (x, y))
     fields: dict[str, Any] = {_FIELDS[kind]: [[x[i], y[i]] for i in range(count)]}
-    weights = unequal_weights(_numbers(file, "WTF", Fraction(1), where), count, f"{where}: WTF")
-    if weights:
-        fields["weights"] = weights
+    weights = _numbers(file, "WTF", Fraction(1), where)
+    fields |= unequal_weights("weights", weights, count, f"{where}: WTF")
     vignetting = _vignetting(file, count, where)
     if vignetting:
         fields["vignetting"] = vignetting

@@ -21,7 +21,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import number_in_text, radius_of, scaled
+from dolens.prescriptions.numbers import number_in_text, scaled
 
 # What a surface's block may say about the way of light.
 SHAPE_OPERANDS = ("TYPE", "CURV", "CONI", "PARM", "XDAT", "DISZ", "GLAS")
@@ -227,11 +227,3 @@ class SurfaceBlock:
         not give it.
         """
         return scaled(self.slots.get(name, "0"), self.factor**power, f"{self.place}: {name}")
-
-
-def curvature_row(curvature: float) -> dict[str, float]:
-    """Return `radius` as a prescription writes it, or `curvature` where no radius means its last
-    bit.
-    """
-    radius = radius_of(curvature)
-    return {"curvature": curvature} if radius is None else {"radius": radius}

@@ -43,7 +43,7 @@ from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
 from dolens.optics.surfaces.coordinate_break import BREAK, DECENTERS
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.numbers import number_in_text, scaled
+from dolens.prescriptions.numbers import number_in_text, radius_row, scaled
 from dolens.prescriptions.other_programs import ReadPrescription, curved_object
 from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.states import STATES_KEY
@@ -54,7 +54,6 @@ from dolens.prescriptions.zemax.file import (
     Line,
     SurfaceBlock,
     ZemaxFile,
-    curvature_row,
     parse_zemax,
 )
 from dolens.prescriptions.zemax.glass import read_glass
@@ -339,7 +338,7 @@ def _image_shape(block: SurfaceBlock) -> dict[str, float]:
     if block.curvature == 0.0:
         return {}
     conic = block.number("CONI")
-    return curvature_row(block.curvature) | ({"conic": conic} if conic else {})
+    return radius_row(block.curvature) | ({"conic": conic} if conic else {})
 
 
 def _object(
@@ -366,7 +365,7 @@ def _curved_object(
     """Return a sentence about an object that is no plane."""
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
-    return curved_object(prescription, curvature_row(block.curvature), place)
+    return curved_object(prescription, radius_row(block.curvature), place)
 
 
 def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:

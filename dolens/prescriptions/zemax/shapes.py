@@ -22,12 +22,13 @@ from dolens.prescriptions.numbers import (
     as_number,
     curvature_in_text,
     number_in_text,
+    radius_row,
     reciprocal,
     scaled,
 )
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND, power_of
-from dolens.prescriptions.zemax.file import SurfaceBlock, curvature_row
+from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax.table import (
     CONIC,
     ORDER,
@@ -130,7 +131,7 @@ def _read_two_curves(block: SurfaceBlock) -> Row:
         curvature = curvature_in_text(block.slots["PARM 1"], f"{block.place}: PARM 1")
         exact = curvature is not None and block.factor == 1
         along_x = {"curvature_x": curvature} if exact else {"radius_x": radius}  # type: ignore[dict-item]
-    along_y = {f"{key}_y": value for key, value in curvature_row(block.curvature).items()}
+    along_y = {f"{key}_y": value for key, value in radius_row(block.curvature).items()}
     return {**along_x, **along_y, "conic_y": block.number("CONI")}
 
 

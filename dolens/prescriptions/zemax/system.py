@@ -66,9 +66,10 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
         n = count_in_text(primary.arguments[0], f"{where}: line {primary.at}: PWAV")
     if n not in numbers:
         raise InputError(f"{where}: PWAV {n} is none of the wavelengths 1 to {len(numbers)}")
-    found = {"wavelengths": values, "reference_wavelength": values[numbers.index(n)]}
-    weighed = unequal_weights(weights, len(values), f"{where}: weights of the wavelengths")
-    return found | ({"wavelength_weights": weighed} if weighed else {})
+    reference = values[numbers.index(n)]
+    found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": reference}
+    place = f"{where}: weights of the wavelengths"
+    return found | unequal_weights("wavelength_weights", weights, len(values), place)
 
 
 def read_fields(
@@ -113,9 +114,8 @@ def read_fields(
     elif number == _ANGLES and finite_object:
         kind = FIELD_KINDS[_HEIGHTS]
     fields: dict[str, Any] = {kind: [list(point) for point in zip(x, y, strict=True)]}
-    weighed = unequal_weights(weights + [1.0] * used, used, f"{where}: weights of the fields")
-    if weighed:
-        fields["weights"] = weighed
+    place = f"{where}: weights of the fields"
+    fields |= unequal_weights("weights", weights + [1.0] * used, used, place)
     rows = [
         {
             name: values[n]

@@ -14,9 +14,9 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import as_integer, as_number, number_in_text, shifted
+from dolens.prescriptions.numbers import as_integer, as_number, number_in_text, radius_row, shifted
 from dolens.prescriptions.other_programs import Number, Table, row_numbers, slot_values
-from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock, curvature_row
+from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock
 
 Row = dict[str, Any]
 
@@ -249,7 +249,7 @@ def conic_line(row: Mapping[str, Any], place: str) -> str:
 
 
 def _read_conic(block: SurfaceBlock) -> Row:
-    return {**curvature_row(block.curvature), "conic": block.number("CONI")}
+    return {**radius_row(block.curvature), "conic": block.number("CONI")}
 
 
 def _read_plain(block: SurfaceBlock) -> Row:
@@ -261,7 +261,7 @@ def _read_plain(block: SurfaceBlock) -> Row:
         return {"type": "conic", **_read_conic(block)}
     if (block.words("CURV") or ["0"])[0] == "0":
         return {"type": "plane"}
-    return {"type": "sphere", **curvature_row(block.curvature)}
+    return {"type": "sphere", **radius_row(block.curvature)}
 
 
 def _write_plain(row: Mapping[str, Any], place: str) -> list[str]:
