@@ -1,4 +1,4 @@
-"""The shape, the aperture and the medium of a CODE V surface.
+"""The shape and the medium of a CODE V surface are read; special shapes are written, too.
 
 `SPS XYP` adds a polynomial in x and y, `SPS ODD` all powers of r, `SPS QBF` is Forbes's Q_bfs;
 `SCO C4 0.1` gives their coefficient 4.  Of `SPS ODD` coefficient 1 is the conic constant (`SCO K`)
@@ -7,10 +7,6 @@ and n + 1 that of rⁿ (`SCO ARn`), from r to r³⁰; 33 is a radius of normalis
 
 `DIF DOE` with `HCT R` is a radial phase: the path is Σ C_i·r^2i at the wavelength HWL, in order
 HOR, and φ = 2π·path/HWL.
-
-`CIR` is a circle, `REX` and `REY` are half widths of a rectangle, `ELX` and `ELY` semi-axes of an
-ellipse; `ADX` and `ADY` move them.  `OBS` behind them makes an obscuration.  `EDG` (a lens's edge)
-and `HOL` (a hole) are mechanical: CODE V draws them.
 """
 
 import math
@@ -25,7 +21,6 @@ from dolens.errors import InputError
 from dolens.prescriptions.codev.file import Block, CodeVFile, unquoted
 from dolens.prescriptions.codev.glass import read_glass
 from dolens.prescriptions.numbers import (
-    as_number,
     curvature_in_text,
     exact,
     number_in_text,
@@ -222,123 +217,6 @@ def _coefficients(block: Block, key: str, place: str, named: bool = False) -> di
         n = int(number[1]) if number else int(power[1]) + 1 if power else 1
         found[f"{key} C{n}"] = command.words[1]
     return found
-
-
-# Commands of an outline → what a prescription calls them.
-_OUTLINES: dict[tuple[str, ...], tuple[str, ...]] = {
-    ("CIR",): ("semi_diameter",),
-    ("REX", "REY"): ("half_width_x", "half_width_y"),
-    ("ELX", "ELY"): ("semi_axis_x", "semi_axis_y"),
-}
-_KEYS = tuple(key for keys in _OUTLINES for key in keys)
-_CENTER = {"ADX": "decenter_x", "ADY": "decenter_y"}
-_USES = ("CLR", "OBS", "EDG", "HOL")
-
-
-def read_apertures(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
-    """Read the clear aperture of a surface as a prescription's row has it.
-
-    Returns:
-        `semi_diameter` or `aperture`, and `obscuration`.  A mechanical edge alone is
-        a semi-diameter that does not clip; without any, the semi-diameter is `auto`.
-
-    Raises:
-        InputError: a turned aperture, or two outlines of one use.
-    """
-    found = _lengths(block, factor, place)
-    row: dict[str, Any] = {}
-    clear, hole = _outline(found, "CLR", place), _outline(found, "OBS", place)
-    if list(clear) == ["semi_diameter"]:
-        row |= clear
-    elif clear:
-        row["aperture"] = clear
-    elif "CIR" in found["EDG"]:
-        row |= {"semi_diameter": found["EDG"]["CIR"], "clips": False}
-    else:
-        row["semi_diameter"] = "auto"
-    if hole:
-        row["obscuration"] = hole
-    return row
-
-
-def has_apertures(block: Block) -> bool:
-    """Return whether a surface's block says anything about its size."""
-    return any(key in block.commands for key in _KEYS)
-
-
-def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
-    """Return the lines of a surface that `read_apertures` reads back."""
-    lines = []
-    edge, hole, size = row.get("aperture"), row.get("obscuration"), row.get("semi_diameter")
-    if isinstance(hole, list | tuple):
-        if len(hole) != 1:
-            raise InputError(f"{place}: several obscurations of a surface are not written")
-        hole = hole[0]
-    if size is not None and size != "auto":
-        use = "" if row.get("clips", True) else "EDG "
-        lines.append(f"  CIR {use}{_text(size, place)}")
-    return lines + _outline_lines(edge or {}, "", place) + _outline_lines(hole or {}, "OBS ", place)
-
-
-def _outline_lines(outline: Mapping[str, Any], use: str, place: str) -> list[str]:
-    lines = []
-    for keys, names in _OUTLINES.items():
-        if all(name in outline for name in names):
-            lines += [
-                f"  {key} {use}{_text(outline[name], place)}"
-                for key, name in zip(keys, names, strict=True)
-            ]
-    return lines + [
-        f"  {key} {use}{_text(outline[name], place)}"
-        for key, name in _CENTER.items()
-        if outline.get(name)
-    ]
-
-
-def _lengths(block: Block, factor: Fraction, place: str) -> dict[str, dict[str, float]]:
-    """Return use → key → mm."""
-    found: dict[str, dict[str, float]] = {use: {} for use in _USES}
-    for command in block.commands.get("ARO", []):
-        use, words = _use(command.words)
-        if use in ("CLR", "OBS") and any(number_in_text(w, f"{place}: ARO") for w in words):
-            raise InputError(f"{place}: a turned aperture is not held (ARO)")
-    for key in (*_KEYS, *_CENTER):
-        for command in block.commands.get(key, []):
-            use, words = _use(command.words)
-            what = f"{place}: {key} (line {command.at})"
-            if len(words) != 1:
-                raise InputError(f"{what} needs one number")
-            if use in ("CLR", "OBS") and key in found[use]:
-                raise InputError(f"{what}: a second aperture of one kind is not held")
-            found[use][key] = scaled(words[0], factor, what)
-    return found
-
-
-def _use(words: list[str]) -> tuple[str, list[str]]:
-    """Take the use and the label (L'A') from the arguments of an aperture's command."""
-    use = next((word.upper() for word in words if word.upper() in _USES), "CLR")
-    rest = [w for w in words if w.upper() not in _USES and w[:2].upper() not in ("L'", 'L"')]
-    return use, rest
-
-
-def _outline(found: dict[str, dict[str, float]], use: str, place: str) -> dict[str, float]:
-    """Return the outline of a use as a prescription has it; empty where there is none."""
-    lengths = found[use]
-    given = [keys for keys in _OUTLINES if any(key in lengths for key in keys)]
-    if len(given) > 1:
-        names = " and ".join(keys[0] for keys in given)
-        raise InputError(f"{place}: an aperture of two outlines is not held ({names})")
-    if not given:
-        return {}
-    for key in given[0]:
-        if key not in lengths:
-            raise InputError(f"{place}: the aperture needs {' and '.join(given[0])}")
-    outline = {n: lengths[key] for key, n in zip(given[0], _OUTLINES[given[0]], strict=True)}
-    return outline | {name: lengths[key] for key, name in _CENTER.items() if lengths.get(key)}
-
-
-def _text(value: object, place: str) -> str:
-    return repr(as_number(value, place))
 
 
 _MIRRORS = ("REFL",)

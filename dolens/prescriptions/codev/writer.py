@@ -8,11 +8,11 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.codev.glass import glass_word, private_glass
-from dolens.prescriptions.codev.reader import break_words, read_codev
+from dolens.prescriptions.codev.placement import aperture_lines, break_words
+from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.surface import (
     LETTERS,
     SPECIALS,
-    aperture_lines,
     number_lines,
     special_lines,
 )
