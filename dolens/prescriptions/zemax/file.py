@@ -18,10 +18,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import number_in_text, scaled
+from dolens.prescriptions.numbers import as_number, number_in_text, scaled
 
 # What a surface's block may say about the way of light.
 SHAPE_OPERANDS = ("TYPE", "CURV", "CONI", "PARM", "XDAT", "DISZ", "GLAS")
@@ -227,3 +227,74 @@ class SurfaceBlock:
         not give it.
         """
         return scaled(self.slots.get(name, "0"), self.factor**power, f"{self.place}: {name}")
+
+
+# A node's numbers, and the powers of a length that they are.
+_NODE = {"sag": 1, "slope_x": 0, "slope_y": 0, "twist": -1}
+
+
+def read_grid(block: SurfaceBlock) -> dict[str, Any]:
+    """Return spacings, sags and slopes of a grid of sags (mm), by the names of a row.
+
+    GDAT has the numbers of columns and rows, and their spacings; `GARR n sag slope slope twist
+    flag` is a node, row after row from +y to -y, and within a row from -x to +x.  Where all slopes
+    are zero they are not given, and come from splines.
+
+    Raises:
+        InputError: a number or a node is missing, or the grid is decentred.
+    """
+    what = f"{block.place}: GDAT"
+    words = block.words("GDAT")
+    if len(words) < 4:
+        raise InputError(f"{what}: needs columns, rows and two spacings")
+    columns, rows = (number_in_text(word, what) for word in words[:2])
+    if min(columns, rows) < 2 or columns != int(columns) or rows != int(rows):
+        raise InputError(f"{what}: needs 2 or more columns and rows, not {words[0]} × {words[1]}")
+    if any(number_in_text(word, what) != 0.0 for word in words[4:6]):
+        raise InputError(f"{what}: a grid that is decentred is not held")
+    spacing_x, spacing_y = (scaled(word, block.factor, what) for word in words[2:4])
+    found: dict[str, Any] = {"spacing_x": spacing_x, "spacing_y": spacing_y}
+    nodes = _nodes(block, int(columns), int(rows))
+    sloped = any(any(node[1:]) for row in nodes for node in row)
+    for place, name in enumerate(_NODE if sloped else ("sag",)):
+        found[name] = [[node[place] for node in row] for row in reversed(nodes)]
+    return found
+
+
+def _nodes(block: SurfaceBlock, columns: int, rows: int) -> list[list[list[float]]]:
+    """Return the numbers of each node, row after row from +y to -y."""
+    given = block.lines.get("GARR", [])
+    if columns * rows > len(given):
+        raise InputError(
+            f"{block.place}: GDAT names {columns} × {rows} nodes, and {len(given)} have a GARR"
+        )
+    nodes: list[list[float] | None] = [None] * (columns * rows)
+    for line in given:
+        what = f"{block.place}: GARR (line {line.at})"
+        if len(line.arguments) < 5:
+            raise InputError(f"{what}: needs a number, sag, two slopes and the twist")
+        node = number_in_text(line.arguments[0], what)
+        if not 0 <= node < len(nodes) or node != int(node):
+            raise InputError(f"{what}: must be a node from 0 to {len(nodes) - 1}, not {node:g}")
+        if any(float(word) != 0.0 for word in line.arguments[5:6]):
+            raise InputError(f"{what}: node {node:g} has no data, which is not held")
+        words = zip(line.arguments[1:5], _NODE.values(), strict=True)
+        nodes[int(node)] = [scaled(word, block.factor**power, what) for word, power in words]
+    full = [node for node in nodes if node is not None]
+    if len(full) < len(nodes):
+        missing = len(nodes) - len(full)
+        raise InputError(f"{block.place}: {missing} of {len(nodes)} nodes have no GARR")
+    return [full[columns * j : columns * (j + 1)] for j in range(rows)]
+
+
+def grid_lines(row: Mapping[str, Any], place: str) -> list[str]:
+    """Return the lines that `read_grid` reads back."""
+    sag = row["sag"]
+    sizes = [as_number(row.get(name), place) for name in ("spacing_x", "spacing_y")]
+    lines = [f"GDAT {len(sag[0])} {len(sag)} {sizes[0]!r} {sizes[1]!r} 0 0"]
+    arrays = [row.get(name) for name in _NODE]
+    nodes = [(j, i) for j in reversed(range(len(sag))) for i in range(len(sag[0]))]
+    for n, (j, i) in enumerate(nodes):
+        numbers = [0.0 if a is None else as_number(a[j][i], place) for a in arrays]
+        lines.append(f"GARR {n} {' '.join(map(repr, numbers))} 0")
+    return lines

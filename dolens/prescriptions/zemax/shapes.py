@@ -4,7 +4,6 @@ A coefficient's slot and unit stand here once, for the reader and the writer.  W
 have in common (medium, aperture, gap, remark) is read and written in `reader` and `writer`.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,26 +19,20 @@ from dolens.optics.surfaces.zernike_phase import (
 )
 from dolens.prescriptions.numbers import (
     as_number,
-    curvature_in_text,
-    number_in_text,
-    radius_row,
-    reciprocal,
-    scaled,
 )
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND, power_of
-from dolens.prescriptions.zemax.file import SurfaceBlock
+from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
 from dolens.prescriptions.zemax.table import (
     CONIC,
     ORDER,
     ORDER_BUT_0,
     PLAIN,
     RADIUS,
+    TWO_CURVES,
     Base,
     Row,
     ZemaxShape,
-    conic_line,
-    curvature_line,
     named,
 )
 
@@ -123,33 +116,6 @@ def _write_break(shape: ZemaxShape, row: Mapping[str, Any], place: str) -> list[
     return [*shape.lines(row, place), f"PARM 6 {int(row.get('order') == 'tilt_first')}"]
 
 
-def _read_two_curves(block: SurfaceBlock) -> Row:
-    """Return radius or curvature along x (PARM 1, where 0 means infinity) and along y."""
-    radius, along_x = block.slot("PARM 1", 1), {"radius_x": math.inf}
-    if radius:
-        # A radius with more digits than a double was written for its curvature's sake.
-        curvature = curvature_in_text(block.slots["PARM 1"], f"{block.place}: PARM 1")
-        exact = curvature is not None and block.factor == 1
-        along_x = {"curvature_x": curvature} if exact else {"radius_x": radius}  # type: ignore[dict-item]
-    along_y = {f"{key}_y": value for key, value in radius_row(block.curvature).items()}
-    return {**along_x, **along_y, "conic_y": block.number("CONI")}
-
-
-def _write_two_curves(row: Mapping[str, Any], place: str) -> list[str]:
-    keys = ("radius", "curvature", "conic")
-    along_y = {key: row[f"{key}_y"] for key in keys if f"{key}_y" in row}
-    if row.get("curvature_x") is not None:
-        curvature = as_number(row["curvature_x"], f"{place}: 'curvature_x'")
-        word = reciprocal(curvature) if curvature else "0"
-    else:
-        radius = as_number(row.get("radius_x"), f"{place}: 'radius_x'", finite=False)
-        word = "0" if math.isinf(radius) else repr(radius)
-    return [curvature_line(along_y, place), conic_line(along_y, place), f"PARM 1 {word}"]
-
-
-_TWO_CURVES = Base(_read_two_curves, _write_two_curves)
-
-
 def _read_biconic(shape: ZemaxShape, block: SurfaceBlock) -> Row:
     row = shape.by_table(block)
     conic_y = row.pop("conic_y")
@@ -219,75 +185,12 @@ def _read_irregular(shape: ZemaxShape, block: SurfaceBlock) -> Row:
     return row
 
 
-# A node's numbers, and the powers of a length that they are.
-_NODE = {"sag": 1, "slope_x": 0, "slope_y": 0, "twist": -1}
-
-
 def _read_grid(shape: ZemaxShape, block: SurfaceBlock) -> Row:
-    """Return an even asphere with a grid of sags.
-
-    GDAT has the numbers of columns and rows, and their spacings; `GARR n sag slope slope twist
-    flag` is a node, row after row from +y to -y, and within a row from -x to +x.  Where all slopes
-    are zero they are not given, and come from splines.
-    """
-    columns, rows, spacings = _grid_size(block)
-    given = block.lines.get("GARR", [])
-    if columns * rows > len(given):
-        raise InputError(
-            f"{block.place}: GDAT names {columns:.6g} × {rows:.6g} nodes, and {len(given)} have a "
-            "GARR"
-        )
-    nodes: list[list[float] | None] = [None] * (columns * rows)
-    for line in given:
-        what = f"{block.place}: GARR (line {line.at})"
-        if len(line.arguments) < 5:
-            raise InputError(f"{what}: needs a number, sag, two slopes and the twist")
-        node = number_in_text(line.arguments[0], what)
-        if not 0 <= node < len(nodes) or node != int(node):
-            raise InputError(f"{what}: must be a node from 0 to {len(nodes) - 1}, not {node:g}")
-        if any(float(word) != 0.0 for word in line.arguments[5:6]):
-            raise InputError(f"{what}: node {node:g} has no data, which is not held")
-        words = zip(line.arguments[1:5], _NODE.values(), strict=True)
-        nodes[int(node)] = [scaled(word, block.factor**power, what) for word, power in words]
-    missing = sum(numbers is None for numbers in nodes)
-    if missing:
-        raise InputError(f"{block.place}: {missing} of {len(nodes)} nodes have no GARR")
-    row = shape.by_table(block) | spacings
-    sloped = any(any(node[1:]) for node in nodes if node)
-    for place, name in enumerate(_NODE if sloped else ("sag",)):
-        row[name] = [
-            [node[place] for node in nodes[columns * j : columns * (j + 1)] if node]
-            for j in reversed(range(rows))
-        ]
-    return row
-
-
-def _grid_size(block: SurfaceBlock) -> tuple[int, int, dict[str, float]]:
-    """Return numbers of columns and rows, and the spacings (mm) by name."""
-    what = f"{block.place}: GDAT"
-    words = block.words("GDAT")
-    if len(words) < 4:
-        raise InputError(f"{what}: needs columns, rows and two spacings")
-    columns, rows = (number_in_text(word, what) for word in words[:2])
-    if min(columns, rows) < 2 or columns != int(columns) or rows != int(rows):
-        raise InputError(f"{what}: needs 2 or more columns and rows, not {words[0]} × {words[1]}")
-    if any(number_in_text(word, what) != 0.0 for word in words[4:6]):
-        raise InputError(f"{what}: a grid that is decentred is not held")
-    spacing_x, spacing_y = (scaled(word, block.factor, what) for word in words[2:4])
-    return int(columns), int(rows), {"spacing_x": spacing_x, "spacing_y": spacing_y}
+    return shape.by_table(block) | read_grid(block)
 
 
 def _write_grid(shape: ZemaxShape, row: Mapping[str, Any], place: str) -> list[str]:
-    sag = row["sag"]
-    sizes = [as_number(row.get(name), place) for name in ("spacing_x", "spacing_y")]
-    lines = shape.lines(row, place)
-    lines.append(f"GDAT {len(sag[0])} {len(sag)} {sizes[0]!r} {sizes[1]!r} 0 0")
-    arrays = [row.get(name) for name in _NODE]
-    nodes = [(j, i) for j in reversed(range(len(sag))) for i in range(len(sag[0]))]
-    for n, (j, i) in enumerate(nodes):
-        numbers = [0.0 if a is None else as_number(a[j][i], place) for a in arrays]
-        lines.append(f"GARR {n} {' '.join(map(repr, numbers))} 0")
-    return lines
+    return [*shape.lines(row, place), *grid_lines(row, place)]
 
 
 def _even_base(block: SurfaceBlock) -> Row:
@@ -438,7 +341,7 @@ SHAPES = {
         ),
         ZemaxShape("DGRATING", _PLAIN_KINDS, PLAIN, _grating(1), phase="grating"),
         ZemaxShape(
-            "TOROGRAT", ("toroid",), _TWO_CURVES, _grating(2), phase="grating", others=("PARM 1",)
+            "TOROGRAT", ("toroid",), TWO_CURVES, _grating(2), phase="grating", others=("PARM 1",)
         ),
         _binary("BINARY_1", "xy", _MONOMIALS),
         _binary("BINARY_2", "radial", (f"p{2 * n}" for n in range(1, _MOST + 1))),
@@ -454,7 +357,7 @@ SHAPES = {
         ZemaxShape(
             "BICONICX",
             ("biconic",),
-            _TWO_CURVES,
+            TWO_CURVES,
             {"PARM 2": Number("conic_x", 0, ALWAYS, 0.0)},
             others=("PARM 1",),
             own_read=_read_biconic,
@@ -462,7 +365,7 @@ SHAPES = {
         ZemaxShape(
             "TOROIDAL",
             ("toroid",),
-            _TWO_CURVES,
+            TWO_CURVES,
             powers_of_r(_parm(*range(2, 9)), range(2, 15, 2)),
             refused={"XDAT": "Zernike polynomials on a toroid are not held"},
             others=("PARM 0", "PARM 1", "XDAT 1", "XDAT 2"),

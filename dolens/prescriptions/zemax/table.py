@@ -14,7 +14,15 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import as_integer, as_number, number_in_text, radius_row, shifted
+from dolens.prescriptions.numbers import (
+    as_integer,
+    as_number,
+    curvature_in_text,
+    number_in_text,
+    radius_row,
+    reciprocal,
+    shifted,
+)
 from dolens.prescriptions.other_programs import Number, Table, row_numbers, slot_values
 from dolens.prescriptions.zemax.file import NAMED_ZERO, SurfaceBlock
 
@@ -275,3 +283,31 @@ def _write_plain(row: Mapping[str, Any], place: str) -> list[str]:
 CONIC = Base(_read_conic, lambda row, place: [curvature_line(row, place), conic_line(row, place)])
 # A plane, a sphere or a conic.
 PLAIN = Base(_read_plain, _write_plain)
+
+
+def _read_two_curves(block: SurfaceBlock) -> Row:
+    """Return radius or curvature along x (PARM 1, where 0 means infinity) and along y."""
+    radius, along_x = block.slot("PARM 1", 1), {"radius_x": math.inf}
+    if radius:
+        # A radius with more digits than a double was written for its curvature's sake.
+        curvature = curvature_in_text(block.slots["PARM 1"], f"{block.place}: PARM 1")
+        exact = curvature is not None and block.factor == 1
+        along_x = {"curvature_x": curvature} if exact else {"radius_x": radius}  # type: ignore[dict-item]
+    along_y = {f"{key}_y": value for key, value in radius_row(block.curvature).items()}
+    return {**along_x, **along_y, "conic_y": block.number("CONI")}
+
+
+def _write_two_curves(row: Mapping[str, Any], place: str) -> list[str]:
+    keys = ("radius", "curvature", "conic")
+    along_y = {key: row[f"{key}_y"] for key in keys if f"{key}_y" in row}
+    if row.get("curvature_x") is not None:
+        curvature = as_number(row["curvature_x"], f"{place}: 'curvature_x'")
+        word = reciprocal(curvature) if curvature else "0"
+    else:
+        radius = as_number(row.get("radius_x"), f"{place}: 'radius_x'", finite=False)
+        word = "0" if math.isinf(radius) else repr(radius)
+    return [curvature_line(along_y, place), conic_line(along_y, place), f"PARM 1 {word}"]
+
+
+# A biconic or a toroid; CURV and CONI are those along y.
+TWO_CURVES = Base(_read_two_curves, _write_two_curves)
