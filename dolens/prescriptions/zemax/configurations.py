@@ -16,7 +16,7 @@ configurations than a lens has states, or whose lines would be read too often fo
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from dolens.errors import InputError, comma_hint
 from dolens.prescriptions.build import lens_from_prescription
@@ -26,12 +26,17 @@ from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax.file import Line, ZemaxFile
 from dolens.prescriptions.zemax.system import last
 
-# Operand → that of the surface whose first argument it is.
-OF_SURFACES = {"THIC": "DISZ", "CRVT": "CURV", "CONN": "CONI", "SDIA": "DIAM"}
-# Operand → that of the surface, and which argument it is.
-OF_APERTURES = {"APMN": ("CLAP", 0), "APMX": ("CLAP", 1)}
+# Operand → the line of a surface, and the argument of it, that it sets.
+_OF_SURFACES = {
+    "THIC": ("DISZ", 0),
+    "CRVT": ("CURV", 0),
+    "CONN": ("CONI", 0),
+    "SDIA": ("DIAM", 0),
+    "APMN": ("CLAP", 0),
+    "APMX": ("CLAP", 1),
+}
 # Operand → lists of the system, one number a field.
-OF_FIELDS = {
+_OF_FIELDS = {
     "XFIE": ("XFLN", "XFLD"),
     "YFIE": ("YFLN", "YFLD"),
     "FLWT": ("FWGN", "FWGT"),
@@ -42,13 +47,91 @@ OF_FIELDS = {
     "FVAN": ("VANN", "ZVAN"),
 }
 # Operand → which argument of WAVM it is, and lists of older files, one number a wavelength.
-OF_WAVELENGTHS: dict[str, tuple[int, tuple[str, ...]]] = {
+_OF_WAVELENGTHS: dict[str, tuple[int, tuple[str, ...]]] = {
     "WAVE": (1, ("WAVL", "WAVN")),
     "WLWT": (2, ("WWGT", "WWGN")),
 }
 _PUPILS = ("OBNA", "ENPD", "FNUM")
 _AIR_OPERANDS = ("TEMP", "PRES")
 _PARAMETER = re.compile(r"PAR(\d)")
+
+
+class Setting(NamedTuple):
+    """A `Setting` is what an operand of configurations sets: of a surface, field or wavelength.
+
+    Attributes:
+        operand: such as `THIC`.
+        number: of the surface, field or wavelength; 0 for the aperture of the system.
+        parameter: of a surface, for `PRAM`; 0 for others.
+    """
+
+    operand: str
+    number: int
+    parameter: int = 0
+
+
+def settings_of(file: ZemaxFile) -> dict[Setting, str]:
+    """Return what a file says where configurations may set another number."""
+    found: dict[Setting, str] = {}
+    for operand, (first, _) in _OF_FIELDS.items():
+        for n, word in enumerate(_last_words(file.system, first), 1):
+            found[Setting(operand, n)] = word
+    for line in file.system.get("WAVM", []):
+        for operand, (at, _) in _OF_WAVELENGTHS.items():
+            found[Setting(operand, int(line.arguments[0]))] = line.arguments[at]
+    for pupil in _PUPILS:
+        if pupil in file.system:
+            found[Setting("APER", 0)] = _last_words(file.system, pupil)[0]
+    for n, block in enumerate(file.surfaces):
+        for operand, (kind, at) in _OF_SURFACES.items():
+            for word in _last_words(block, kind)[at : at + 1]:
+                found[Setting(operand, n)] = "1.0E+10" if word.upper() == "INFINITY" else word
+        for line in block.get("PARM", []):
+            found[Setting("PRAM", n, int(line.arguments[0]))] = line.arguments[1]
+    return found
+
+
+def settings_between(before: ZemaxFile, after: ZemaxFile, place: str) -> dict[Setting, str]:
+    """Return the settings that make one file of another.
+
+    Raises:
+        InputError: the files differ in what no configuration can set; `place` begins the message.
+    """
+    own, others = settings_of(before), settings_of(after)
+    for n, (one, other) in enumerate(
+        zip([before.system, *before.surfaces], [after.system, *after.surfaces], strict=True), -1
+    ):
+        for operand in dict.fromkeys((*one, *other)):
+            if operand in ("NAME", "PARM") or _fixed(one, operand) == _fixed(other, operand):
+                continue
+            if operand == "FTYP":
+                same = _last_words(one, operand)[:1] == _last_words(other, operand)[:1]
+                what = "as many fields and wavelengths" if same else "fields of one kind"
+                raise InputError(f"{place}: a .zmx file has {what} in all its states")
+            surface = f"surface {n}: " if n >= 0 else ""
+            raise InputError(
+                f"{place}: {surface}no configuration of a .zmx file can change {operand}"
+            )
+    settings = dict.fromkeys((*own, *others))
+    return {s: others.get(s, "0.0") for s in settings if own.get(s) != others.get(s)}
+
+
+_LISTS = {name for names in _OF_FIELDS.values() for name in names}
+
+
+def _fixed(lines: Mapping[str, list[Line]], operand: str) -> list[list[str]]:
+    """Return the words of an operand without those that configurations may set."""
+    set_at = {at for kind, at in _OF_SURFACES.values() if kind == operand}
+    set_at |= {at for at, _ in _OF_WAVELENGTHS.values()} if operand == "WAVM" else set()
+    set_at |= {0} if operand in _PUPILS else set()
+    return [
+        ["" if at in set_at or operand in _LISTS else w for at, w in enumerate(line.arguments)]
+        for line in lines.get(operand, [])
+    ]
+
+
+def _last_words(lines: Mapping[str, list[Line]], operand: str) -> list[str]:
+    return lines[operand][-1].arguments if operand in lines else []
 
 
 def apply_setting(file: ZemaxFile, line: Line) -> None:
@@ -60,11 +143,8 @@ def apply_setting(file: ZemaxFile, line: Line) -> None:
     operand, (target, _, value) = line.operand, line.arguments[:3]
     at = int(number_in_text(target, f"line {line.at}"))
     parameter = _PARAMETER.fullmatch(operand)
-    if operand in OF_SURFACES:
-        _replace(_surface(file, at, line), OF_SURFACES[operand], 0, value)
-    elif operand in OF_APERTURES:
-        kind, place = OF_APERTURES[operand]
-        _replace(_surface(file, at, line), kind, place, value)
+    if operand in _OF_SURFACES:
+        _replace(_surface(file, at, line), *_OF_SURFACES[operand], value)
     elif operand == "PRAM" or parameter:
         # Files of old have the parameter's number elsewhere.
         number = parameter[1] if parameter else (*line.arguments, *"00000")[4]
@@ -73,14 +153,14 @@ def apply_setting(file: ZemaxFile, line: Line) -> None:
             raise InputError(f"{operand} of surface {at} does not say which parameter it is")
         lines[:] = [one for one in lines if one.arguments[:1] != [number]]
         lines.append(Line(line.at, "PARM", [number, value], f"{number} {value}"))
-    elif operand in OF_FIELDS:
-        lists = [name for name in OF_FIELDS[operand] if name in file.system]
+    elif operand in _OF_FIELDS:
+        lists = [name for name in _OF_FIELDS[operand] if name in file.system]
         if not lists or "FEFD" in file.system:
             raise InputError(f"{operand} {at} has no place in the lists of fields")
         for name in lists:
             _replace(file.system, name, at - 1, value)
-    elif operand in OF_WAVELENGTHS:
-        place, older = OF_WAVELENGTHS[operand]
+    elif operand in _OF_WAVELENGTHS:
+        place, older = _OF_WAVELENGTHS[operand]
         lines = file.system.get("WAVM", [])
         for n, one in enumerate(lines):
             if one.arguments[:1] == [str(at)]:

@@ -185,14 +185,6 @@ def _read_irregular(shape: ZemaxShape, block: SurfaceBlock) -> Row:
     return row
 
 
-def _read_grid(shape: ZemaxShape, block: SurfaceBlock) -> Row:
-    return shape.by_table(block) | read_grid(block)
-
-
-def _write_grid(shape: ZemaxShape, row: Mapping[str, Any], place: str) -> list[str]:
-    return [*shape.lines(row, place), *grid_lines(row, place)]
-
-
 def _even_base(block: SurfaceBlock) -> Row:
     """Return an even asphere where a coefficient is not zero, or named."""
     if any(named(block.slots.get(slot, "0")) for slot in _EVEN):
@@ -403,8 +395,11 @@ SHAPES = {
                 "XDAT": "Zernike polynomials on a grid are not held",
             },
             others=("PARM 9", "PARM 10", "XDAT 1", "XDAT 2"),
-            own_read=_read_grid,
-            own_write=_write_grid,
+            own_read=lambda shape, block: shape.by_table(block) | read_grid(block),
+            own_write=lambda shape, row, place: [
+                *shape.lines(row, place),
+                *grid_lines(row, place),
+            ],
         ),
         JONES_MATRIX,
     )
