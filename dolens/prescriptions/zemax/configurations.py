@@ -24,7 +24,6 @@ from dolens.prescriptions.numbers import number_in_text
 from dolens.prescriptions.states import MOST_STATES
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax.file import Line, ZemaxFile
-from dolens.prescriptions.zemax.system import last
 
 # Operand → the line of a surface, and the argument of it, that it sets.
 _OF_SURFACES = {
@@ -227,14 +226,6 @@ _WAVES = ("wavelengths", "wavelength_weights", "reference_wavelength")
 _KEYS = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS)
 
 
-def configuration_lines(file: ZemaxFile) -> list[Line]:
-    """Return the lines behind MNUM that set something, of all configurations."""
-    begin = file.system.get("MNUM")
-    if not begin:
-        return []
-    return [line for line in file.tail if line.at > begin[-1].at and line.operand != "MOFF"]
-
-
 def read_configurations(
     file: ZemaxFile, lens: dict[str, Any], read: Read, where: str
 ) -> tuple[dict[str, Any], list[str]]:
@@ -259,7 +250,7 @@ def read_configurations(
     if count != int(count) or current != int(current):
         raise InputError(f"{place} must have whole numbers, not '{begin[-1].text}'")
     count, current = int(count), int(current) or 1
-    for line in configuration_lines(file):
+    for line in file.configuration_lines():
         for word in line.arguments[:3]:
             if comma_hint(word):
                 what = f"{where}: line {line.at}: {line.operand}"
@@ -304,7 +295,7 @@ def read_configurations(
 def _differing(file: ZemaxFile) -> list[str]:
     """Return the operands whose values differ between configurations, with their surfaces."""
     values: dict[str, set[str]] = {}
-    for line in configuration_lines(file):
+    for line in file.configuration_lines():
         if len(line.arguments) > 2 and line.operand not in _SILENT:
             values.setdefault(f"{line.operand} {line.arguments[0]}", set()).add(line.arguments[2])
     return [name for name, words in values.items() if len(words) > 1]
@@ -319,7 +310,7 @@ def _lines_of(file: ZemaxFile) -> int:
 def _settings(file: ZemaxFile, differ: set[str], where: str) -> dict[float, list[Line]]:
     """Return the lines of each configuration that set what differs between them."""
     found: dict[float, list[Line]] = {}
-    for line in configuration_lines(file):
+    for line in file.configuration_lines():
         if line.operand in _SILENT or len(line.arguments) < 3:
             continue
         number = number_in_text(line.arguments[1], f"{where}: line {line.at}")
@@ -444,7 +435,7 @@ def _names(
     one whose title is the lens's own.
     """
     titles = {}
-    for line in configuration_lines(file):
+    for line in file.configuration_lines():
         if line.operand == TITLE and len(line.arguments) > 2:
             titles[int(number_in_text(line.arguments[1], ""))] = line.text.split('"')[1:2]
     names: dict[Any, Any] = {}
@@ -460,55 +451,3 @@ def _names(
 def own_title(lens: Mapping[str, Any]) -> str:
     """Return the title of a configuration that is the lens itself and none of its states."""
     return f"the lens itself: {lens.get('name', '')}".strip()
-
-
-# Temperature and pressure, and what a file without ENVD means by them.
-_AIR = {"TEMP": 20.0, "PRES": 1.0}
-# Lines round what ENVD says to a dozen digits.
-_SAME_AIR = 1e-6
-
-
-def refuse_own_air(file: ZemaxFile, where: str) -> None:
-    """Refuse media at a temperature or pressure that is not the system's.
-
-    TEMP and PRES hold for the GLSS behind them, in the same configuration: so a lens may stand in a
-    vacuum between windows.  Where MNUM does not say which configuration is the current one, one
-    must be as the system is.
-
-    Raises:
-        InputError: a GLSS of the current configuration stands behind another temperature or
-            pressure than ENVD has.
-    """
-    begin = file.system.get("MNUM")
-    if not begin or not begin[-1].arguments:
-        return
-    place = f"{where}: line {begin[-1].at}: MNUM"
-    count, *current = (number_in_text(word, place) for word in begin[-1].arguments[:2])
-    # Older files give no current one.
-    candidates = [current[0] or 1.0] if current else range(1, int(count) + 1)
-    found = [_own_air(file, where, number) for number in candidates]
-    if found and all(found):
-        raise InputError(f"{where}: {found[0]}")
-
-
-def _own_air(file: ZemaxFile, where: str, configuration: float) -> str:
-    """Return which medium has a temperature or pressure of its own, nothing where none has."""
-    line = last(file, "ENVD")
-    given = [number_in_text(word, f"{where}: ENVD") for word in line.arguments[:2]] if line else []
-    air = _AIR | dict(zip(_AIR, given, strict=False))
-    here = air
-    for line in configuration_lines(file):
-        place = f"{where}: line {line.at}: {line.operand}"
-        if line.operand not in (*_AIR, "GLSS") or len(line.arguments) < 3:
-            continue
-        if number_in_text(line.arguments[1], place) != configuration:
-            continue
-        if line.operand in _AIR:
-            here = {**here, line.operand: number_in_text(line.arguments[2], place)}
-        elif any(abs(here[key] - air[key]) > _SAME_AIR for key in _AIR):
-            return (
-                f"surface {line.arguments[0]}: a medium at a temperature or pressure of its own is "
-                f"not held (GLSS behind TEMP {here['TEMP']:g} and PRES {here['PRES']:g}, line "
-                f"{line.at})"
-            )
-    return ""

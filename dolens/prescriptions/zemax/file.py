@@ -81,6 +81,13 @@ class ZemaxFile:
     passed_over: dict[str, list[Line]] = field(default_factory=dict)
     skipped: list[int] = field(default_factory=list)
 
+    def configuration_lines(self) -> list[Line]:
+        """Return the lines behind MNUM that set something, of all configurations."""
+        begin = self.system.get("MNUM")
+        if not begin:
+            return []
+        return [line for line in self.tail if line.at > begin[-1].at and line.operand != "MOFF"]
+
 
 def encode_zemax(text: str) -> bytes:
     """Encode a `.zmx` file with Zemax's line ends: ASCII where that is enough, else UTF-16."""

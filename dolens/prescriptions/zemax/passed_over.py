@@ -9,7 +9,6 @@ from itertools import zip_longest
 
 from dolens.errors import InputError
 from dolens.prescriptions.numbers import number_in_text
-from dolens.prescriptions.zemax.configurations import configuration_lines
 from dolens.prescriptions.zemax.file import Line, ZemaxFile
 from dolens.prescriptions.zemax.shapes import JONES_MATRIX
 
@@ -69,7 +68,7 @@ def further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
             and tuple(map(_number_or_word, words[:2])) != _USUAL_AIR[: len(words)]
         ):
             yield _AIR, "ENVD"
-    for line in configuration_lines(file):
+    for line in file.configuration_lines():
         words = list(line.arguments[3:])
         if line.operand == "PRAM":
             words[1:2] = ["0"]  # which parameter it is

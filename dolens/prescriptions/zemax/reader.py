@@ -49,7 +49,7 @@ from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax.apertures import is_fixed, read_apertures
-from dolens.prescriptions.zemax.configurations import read_configurations, refuse_own_air
+from dolens.prescriptions.zemax.configurations import read_configurations
 from dolens.prescriptions.zemax.file import (
     Line,
     SurfaceBlock,
@@ -59,7 +59,7 @@ from dolens.prescriptions.zemax.file import (
 from dolens.prescriptions.zemax.glass import read_glass
 from dolens.prescriptions.zemax.passed_over import passed_over
 from dolens.prescriptions.zemax.shapes import shape_of_block
-from dolens.prescriptions.zemax.system import factor_to_mm, read_system
+from dolens.prescriptions.zemax.system import factor_to_mm, read_system, refuse_own_air
 from dolens.prescriptions.zemax.table import Row
 
 _BEFORE, _AFTER, _RETURN = "1", "2", "3"
