@@ -14,7 +14,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
 from dolens.prescriptions.numbers import as_number, radius_row
-from dolens.prescriptions.other_programs import ReadPrescription, paraxial_image
+from dolens.prescriptions.other_programs import D_LINE, ReadPrescription, paraxial_image
 from dolens.prescriptions.plain_values import difference, even_powers, mapping, number, rows
 
 _STOPS = ("Aperture", "Stop")
@@ -32,7 +32,6 @@ _NOT_HELD = {
 _POSITIONS = 1e-3
 # Focal lengths that are noted are rounded, and of other wavelengths.
 _FOCAL_LENGTHS = 0.05
-_D_LINE = 587.5618
 _FAR = -20000.0
 
 
@@ -120,7 +119,7 @@ def _require_focal_length(
         radius = row.get("radius", math.inf)
         curvatures.append(row.get("curvature", 1.0 / radius) + 2.0 * row.get("a2", 0.0))
         try:
-            indices.append(float(parse_material(str(row["material"]), model).index(_D_LINE)))
+            indices.append(float(parse_material(str(row["material"]), model).index(D_LINE)))
         except InputError:
             return  # the lens is refused for this medium, by name, when it is built
     gaps = [row["thickness"] for row in surfaces.values() if "thickness" in row]

@@ -29,6 +29,11 @@ def as_number(value: object, what: str, finite: bool = True) -> float:
     return number
 
 
+def number_text(value: object, what: str) -> str:
+    """Return a number as files get it, from which every bit comes back."""
+    return repr(as_number(value, what))
+
+
 def as_positive(value: object, what: str) -> float:
     """Return a finite number above zero."""
     found = as_number(value, what)

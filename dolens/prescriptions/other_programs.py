@@ -145,6 +145,34 @@ def slot_values(
     return found
 
 
+# The wavelength (nm) of a file that cannot do without one.
+D_LINE = 587.5618
+
+
+def require_dfc(prescription: Mapping[str, Any], suffix: str, where: str) -> None:
+    """Refuse to write a lens whose indices other programs' files cannot mean."""
+    model = str(prescription.get("index_model", "dfc"))
+    if model != "dfc":
+        raise InputError(
+            f"{where}: a {suffix} file cannot hold index_model '{model}' (allowed: dfc; its nd and "
+            "Vd are those of the lines C, d, F, and its air has index 1)"
+        )
+
+
+def written_wavelengths(prescription: Mapping[str, Any], where: str) -> tuple[list[float], int]:
+    """Return the wavelengths (nm) that a file gets, and the number of the reference from 1.
+
+    Raises:
+        InputError: the reference is none of them.
+    """
+    waves = prescription.get("wavelengths") or [D_LINE]
+    waves = [as_number(wave, f"{where}: 'wavelengths'") for wave in waves]
+    reference = float(prescription.get("reference_wavelength") or waves[0])
+    if reference not in waves:
+        raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
+    return waves, waves.index(reference) + 1
+
+
 _DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
 
 

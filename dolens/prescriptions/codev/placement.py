@@ -17,7 +17,13 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.codev.file import Block
-from dolens.prescriptions.numbers import as_number, exact, nearest, number_in_text, scaled
+from dolens.prescriptions.numbers import (
+    exact,
+    nearest,
+    number_in_text,
+    number_text,
+    scaled,
+)
 
 _SHIFTS = {"XDE": "decenter_x", "YDE": "decenter_y"}
 # Key → prescription's key, and whether the turn has the other sense.
@@ -169,7 +175,7 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
         hole = hole[0]
     if size is not None and size != "auto":
         use = "" if row.get("clips", True) else "EDG "
-        lines.append(f"  CIR {use}{_text(size, place)}")
+        lines.append(f"  CIR {use}{number_text(size, place)}")
     return lines + _outline_lines(edge or {}, "", place) + _outline_lines(hole or {}, "OBS ", place)
 
 
@@ -178,11 +184,11 @@ def _outline_lines(outline: Mapping[str, Any], use: str, place: str) -> list[str
     for keys, names in _OUTLINES.items():
         if all(name in outline for name in names):
             lines += [
-                f"  {key} {use}{_text(outline[name], place)}"
+                f"  {key} {use}{number_text(outline[name], place)}"
                 for key, name in zip(keys, names, strict=True)
             ]
     return lines + [
-        f"  {key} {use}{_text(outline[name], place)}"
+        f"  {key} {use}{number_text(outline[name], place)}"
         for key, name in _CENTER.items()
         if outline.get(name)
     ]
@@ -228,7 +234,3 @@ def _outline(found: dict[str, dict[str, float]], use: str, place: str) -> dict[s
             raise InputError(f"{place}: the aperture needs {' and '.join(given[0])}")
     outline = {n: lengths[key] for key, n in zip(given[0], _OUTLINES[given[0]], strict=True)}
     return outline | {name: lengths[key] for key, name in _CENTER.items() if lengths.get(key)}
-
-
-def _text(value: object, place: str) -> str:
-    return repr(as_number(value, place))

@@ -10,8 +10,8 @@ from functools import partial
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import as_integer, as_number, shifted
-from dolens.prescriptions.other_programs import require_same
+from dolens.prescriptions.numbers import as_integer, as_number, number_text, shifted
+from dolens.prescriptions.other_programs import require_dfc, require_same, written_wavelengths
 from dolens.prescriptions.row_data import canonical
 from dolens.prescriptions.states import STATES_KEY, merged_prescription
 from dolens.prescriptions.zemax.apertures import aperture_lines
@@ -83,7 +83,6 @@ def configurations_of(
     return lines
 
 
-_D_LINE = 587.5618
 # Fields in the lists; further ones have lines of their own.
 _LISTED = 12
 
@@ -130,12 +129,7 @@ def _without_states(prescription: Mapping[str, Any], where: str) -> str:
 
 def _written(prescription: Mapping[str, Any], where: str) -> str:
     """Write a prescription without its states; nothing is read back."""
-    model = str(prescription.get("index_model", "dfc"))
-    if model != "dfc":
-        raise InputError(
-            f"{where}: a .zmx file cannot hold index_model '{model}' (allowed: dfc; its nd and Vd "
-            "are those of the lines C, d, F, and its air has index 1)"
-        )
+    require_dfc(prescription, ".zmx", where)
     surfaces = {str(n): row for n, row in prescription["surfaces"].items()}
     sensor = prescription["sensor"]
     stop = as_integer(prescription.get("stop", 1), f"{where}: 'stop'")
@@ -146,7 +140,7 @@ def _written(prescription: Mapping[str, Any], where: str) -> str:
         "  TYPE STANDARD",
         "  CURV 0.0",
         *glass_line(prescription.get("object_material", "air"), f"{where}: object"),
-        f"  DISZ {'INFINITY' if distance is None else _text(distance, where)}",
+        f"  DISZ {'INFINITY' if distance is None else number_text(distance, where)}",
         '  DIAM 0 0 0 0 1 ""',
     ]
     for n, row in surfaces.items():
@@ -154,7 +148,7 @@ def _written(prescription: Mapping[str, Any], where: str) -> str:
         gap = row.get("thickness", sensor["distance"])
         lines += [f"SURF {n}", *(["  STOP"] if str(stop) == n else [])]
         lines += _surface(row, place)
-        lines.append(f"  DISZ {_text(gap, place)}")
+        lines.append(f"  DISZ {number_text(gap, place)}")
     diameter = as_number(sensor.get("diameter") or 0.0, f"{where}: 'sensor.diameter'")
     lines += [
         f"SURF {len(surfaces) + 1}",
@@ -184,11 +178,7 @@ _PUPILS = {
 
 
 def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where: str) -> list[str]:
-    waves = prescription.get("wavelengths") or [_D_LINE]
-    waves = [as_number(wave, f"{where}: 'wavelengths'") for wave in waves]
-    reference = float(prescription.get("reference_wavelength") or waves[0])
-    if reference not in waves:
-        raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
+    waves, reference = written_wavelengths(prescription, where)
     weights = prescription.get("wavelength_weights") or [1.0] * len(waves)
     materials = [row.get("material") for row in surfaces.values()]
     materials.append(prescription.get("object_material", "air"))
@@ -206,10 +196,10 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         *(["RAIM 0 2 1 1 0 0 0 0 0"] if prescription.get("real_pupil") else []),
         *_fields(prescription, len(waves), where),
         *(
-            f"WAVM {i} {shifted(wave, -3)} {_text(weight, where)}"
+            f"WAVM {i} {shifted(wave, -3)} {number_text(weight, where)}"
             for i, (wave, weight) in enumerate(zip(waves, weights, strict=False), 1)
         ),
-        f"PWAV {waves.index(reference) + 1}",
+        f"PWAV {reference}",
     ]
 
 
@@ -236,7 +226,7 @@ def _fields(prescription: Mapping[str, Any], waves: int, where: str) -> list[str
     vignetting = fields.get("vignetting") or [{}] * len(points)
     columns = [[point[0] for point in points], [point[1] for point in points], weights]
     columns += [[row.get(name, 0.0) for row in vignetting] for name, *_ in VIGNETTING_OPERANDS]
-    texts = [[_text(value, f"{where}: fields") for value in column] for column in columns]
+    texts = [[number_text(value, f"{where}: fields") for value in column] for column in columns]
     operands = ("XFLN", "YFLN", "FWGN", *(operand for _, operand, _ in VIGNETTING_OPERANDS))
     telecentric = int(bool(prescription.get("telecentric_object")))
     lines = [f"FTYP {kinds[kind]} {telecentric} {len(points)} {waves} 0 0 0"]
@@ -250,15 +240,15 @@ def _fields(prescription: Mapping[str, Any], waves: int, where: str) -> list[str
 def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
     for key, form in _PUPILS.items():
         if prescription.get(key) is not None:
-            return [form.format(_text(prescription[key], where))]
+            return [form.format(number_text(prescription[key], where))]
     return ["FLOA"]
 
 
 def _air(prescription: Mapping[str, Any], where: str) -> str:
     if prescription.get("temperature") is None and prescription.get("pressure") is None:
         return "ENVD 20 1 0"
-    temperature = _text(prescription.get("temperature", 20.0), where)
-    return f"ENVD {temperature} {_text(prescription.get('pressure', 1.0), where)} 1"
+    temperature = number_text(prescription.get("temperature", 20.0), where)
+    return f"ENVD {temperature} {number_text(prescription.get('pressure', 1.0), where)} 1"
 
 
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:
@@ -271,7 +261,3 @@ def _surface(row: Mapping[str, Any], place: str) -> list[str]:
     if not shape.surface:
         return lines
     return [*lines, *glass_line(row.get("material"), place), *aperture_lines(row, place)]
-
-
-def _text(value: object, place: str) -> str:
-    return repr(as_number(value, place))
