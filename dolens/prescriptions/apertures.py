@@ -78,6 +78,12 @@ _BLOCKING: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
 )
 _OPTIONAL: dict[Any, tuple[str, ...]] = {Spider: ("angle",)}
 _CENTER = ("decenter_x", "decenter_y")
+# Points of the pupil's rim.
+_RIM = 16
+# Where nothing tells a size, mm.
+_UNKNOWN = 1.0
+# Of the light's height: a drawn semi-diameter below is not where the light is.
+_TINY = 0.01
 
 
 def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
@@ -243,14 +249,6 @@ def _vertices(value: object, place: str) -> tuple[tuple[tuple[float, float], ...
     if not polygons:
         raise InputError(f"{place}: must be a list of lists of vertices [x, y] (mm)")
     return tuple(tuple((x, y) for x, y in polygon) for polygon in polygons)
-
-
-# Points of the pupil's rim.
-_RIM = 16
-# Where nothing tells a size, mm.
-_UNKNOWN = 1.0
-# Of the light's height: a drawn semi-diameter below is not where the light is.
-_TINY = 0.01
 
 
 @torch.no_grad()

@@ -42,6 +42,8 @@ _LETTERS |= {"aperture": "A", "xy_polynomial": "X"}
 _HEADER_KEYS = ("source", "index_model", "stop", *SYSTEM_DATA_KEYS)
 _MONOMIALS = ("", "y", "x", "y2", "xy", "x2", "y3", "xy2", "x2y", "x3")
 _COMMON = ("type", "radius", "curvature", "semi_diameter", "thickness", "material")
+_MEDIA = {"air": "air", "occluder": "occluder", "vacuum": "occluder"}
+_PAIR = re.compile(r"\d+(\.\d+)?/\d+(\.\d+)?")
 
 
 def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, Any]:
@@ -305,8 +307,6 @@ DIFFOPTICS_GLASSES = {
     "ssk4": "1.61770/55.116",
     "uvfs": "1.458/67.82",
 }
-_MEDIA = {"air": "air", "occluder": "occluder", "vacuum": "occluder"}
-_PAIR = re.compile(r"\d+(\.\d+)?/\d+(\.\d+)?")
 
 
 def diffoptics_material(name: str, place: str) -> str:

@@ -49,6 +49,10 @@ _PUBLISHED = "published"
 _WHOLE = (".yaml", ".yml", ".json")
 # What has no place for the source itself; `dolens convert` says that it is lost.
 _WITHOUT_SOURCE = (".seq", ".txt")
+# The beginning of a message that says where in the file, and the end that says how it is written.
+_PLACE = re.compile(r"(?:surface \d+|line \d+|the object|the image|element \w+|[A-Z]{4}): ")
+_DETAIL = re.compile(r" \(.*|; .*", re.DOTALL)
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 
 def lens_names() -> list[str]:
@@ -214,12 +218,6 @@ def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None
         content = encode_prescription(prescription, path)
     with written_whole(path) as aside:
         aside.write_bytes(content)
-
-
-# The beginning of a message that says where in the file, and the end that says how it is written.
-_PLACE = re.compile(r"(?:surface \d+|line \d+|the object|the image|element \w+|[A-Z]{4}): ")
-_DETAIL = re.compile(r" \(.*|; .*", re.DOTALL)
-_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)

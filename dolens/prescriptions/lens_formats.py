@@ -40,6 +40,30 @@ MOST_BYTES = 64 * 2**20
 _LOOKED_AT = 65536
 
 _JsonReader = Callable[[dict[str, Any], str], ReadPrescription]
+_UTF_32 = (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")
+_UNPACK = "unpack it, and give the lens file that it holds"
+# First bytes → what the file is, and what to do.
+_BEGINNINGS: tuple[tuple[bytes, str], ...] = (
+    (b"PK\x03\x04", f"is a .zip archive; {_UNPACK}"),
+    (b"\x1f\x8b", f"is compressed (gzip); {_UNPACK}"),
+    (b"7z\xbc\xaf", f"is a .7z archive; {_UNPACK}"),
+    (b"Rar!", f"is a .rar archive; {_UNPACK}"),
+    (b"\xfd7zXZ", f"is compressed (xz); {_UNPACK}"),
+    (b"BZh", f"is compressed (bzip2); {_UNPACK}"),
+    (b"ZoS", "is OpticStudio's binary form of a lens (.zos); save it as .zmx there"),
+    (b"%PDF", "is a PDF document, no lens file"),
+    (b"\x89PNG", "is a PNG picture, no lens file"),
+    (b"\xff\xd8\xff", "is a JPEG picture, no lens file"),
+    (b"GIF8", "is a GIF picture, no lens file"),
+    (b"\xd0\xcf\x11\xe0", "is a document of Microsoft Office, no lens file"),
+    (b"\x80\x02", "is a Python pickle, which is never read; save the lens as text"),
+)
+# OpticStudio's archives begin with their version.
+_ZAR = (b"\xea\x00\x00\x00", b"\xec\x03\x00\x00")
+# CODE V's own files begin with these bytes.
+_CODE_V = b"]\x00\x00\x00"
+_CONTROL = frozenset(range(32)) - {9, 10, 11, 12, 13, 26, 27}
+_BEGIN = 4096
 
 
 @dataclass(frozen=True)
@@ -243,32 +267,6 @@ def _utf_8(data: bytes, where: str, kind: str) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: is not valid {kind} ({error})") from None
-
-
-_UTF_32 = (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")
-_UNPACK = "unpack it, and give the lens file that it holds"
-# First bytes → what the file is, and what to do.
-_BEGINNINGS: tuple[tuple[bytes, str], ...] = (
-    (b"PK\x03\x04", f"is a .zip archive; {_UNPACK}"),
-    (b"\x1f\x8b", f"is compressed (gzip); {_UNPACK}"),
-    (b"7z\xbc\xaf", f"is a .7z archive; {_UNPACK}"),
-    (b"Rar!", f"is a .rar archive; {_UNPACK}"),
-    (b"\xfd7zXZ", f"is compressed (xz); {_UNPACK}"),
-    (b"BZh", f"is compressed (bzip2); {_UNPACK}"),
-    (b"ZoS", "is OpticStudio's binary form of a lens (.zos); save it as .zmx there"),
-    (b"%PDF", "is a PDF document, no lens file"),
-    (b"\x89PNG", "is a PNG picture, no lens file"),
-    (b"\xff\xd8\xff", "is a JPEG picture, no lens file"),
-    (b"GIF8", "is a GIF picture, no lens file"),
-    (b"\xd0\xcf\x11\xe0", "is a document of Microsoft Office, no lens file"),
-    (b"\x80\x02", "is a Python pickle, which is never read; save the lens as text"),
-)
-# OpticStudio's archives begin with their version.
-_ZAR = (b"\xea\x00\x00\x00", b"\xec\x03\x00\x00")
-# CODE V's own files begin with these bytes.
-_CODE_V = b"]\x00\x00\x00"
-_CONTROL = frozenset(range(32)) - {9, 10, 11, 12, 13, 26, 27}
-_BEGIN = 4096
 
 
 def require_text(data: bytes, where: str) -> None:

@@ -38,6 +38,13 @@ _NM = {"um": 1e3, "nm": 1.0, "mm": 1e6, "m": 1e9}
 _INFINITE = 1e10
 # How light goes on behind a surface: by refraction or reflection, or as an ideal lens sends it.
 _REFRACTS, _IDEAL = "RefractiveReflectiveModel", "ThinLensInteractionModel"
+_DEFINITIONS = {
+    "AngleField": "angle",
+    "ObjectHeightField": "object_height",
+    "ParaxialImageHeightField": "paraxial_image_height",
+    "RealImageHeightField": "real_image_height",
+}
+_CIRCLES = ("RadialAperture", "ConfigurableRadialAperture", "OffsetRadialAperture")
 
 
 def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
@@ -262,14 +269,6 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     return {"fields": found | unequal_weights("weights", weights, len(points), place)}
 
 
-_DEFINITIONS = {
-    "AngleField": "angle",
-    "ObjectHeightField": "object_height",
-    "ParaxialImageHeightField": "paraxial_image_height",
-    "RealImageHeightField": "real_image_height",
-}
-
-
 def _pupil(content: dict[str, Any], where: str) -> dict[str, Any]:
     aperture = content.get("aperture")
     if aperture is None:
@@ -290,9 +289,6 @@ def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
     if shape["type"] not in ("plane", "sphere", "conic"):
         raise InputError(f"{place}: an image of this shape is not held")
     return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
-
-
-_CIRCLES = ("RadialAperture", "ConfigurableRadialAperture", "OffsetRadialAperture")
 
 
 def aperture_row(content: object, place: str) -> dict[str, Any]:

@@ -74,6 +74,9 @@ _REFUSED = {
     "SPL": "a spline surface",
     "ZRX": "a Zernike surface",
 }
+_INFINITE = 1e10
+_MICROMETRE = Fraction(1000)
+_PLACES = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ")
 
 
 class Line(NamedTuple):
@@ -151,10 +154,6 @@ def _sort(file: OsloFile, line: Line, place: str) -> None:
 
 
 Block = dict[str, Line]
-
-_INFINITE = 1e10
-_MICROMETRE = Fraction(1000)
-_PLACES = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ")
 
 
 def read_oslo(text: str, where: str) -> ReadPrescription:

@@ -10,6 +10,13 @@ from dolens.errors import InputError
 from dolens.prescriptions.numbers import as_number, nearest, number_in_text, scaled
 from dolens.prescriptions.row_data import power_of
 
+ALWAYS = "always"
+# Coefficients of rotational powers, Forbes's and Zernike's polynomials, phases, and monomials.
+_TERM = re.compile(r"[apqz]\d+|(?=[xy])(x\d*)?(y\d*)?")
+# The wavelength (nm) of a file that cannot do without one.
+D_LINE = 587.5618
+_DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
+
 
 class ReadPrescription(NamedTuple):
     """A `ReadPrescription` is the content of a lens file as plain data.
@@ -46,10 +53,7 @@ class Number(NamedTuple):
     shift: int = 0
 
 
-ALWAYS = "always"
 Table = Mapping[str, Number]
-# Coefficients of rotational powers, Forbes's and Zernike's polynomials, phases, and monomials.
-_TERM = re.compile(r"[apqz]\d+|(?=[xy])(x\d*)?(y\d*)?")
 
 
 def powers_of_r(slots: Iterable[str], powers: Iterable[int]) -> dict[str, Number]:
@@ -145,10 +149,6 @@ def slot_values(
     return found
 
 
-# The wavelength (nm) of a file that cannot do without one.
-D_LINE = 587.5618
-
-
 def require_dfc(prescription: Mapping[str, Any], suffix: str, where: str) -> None:
     """Refuse to write a lens whose indices other programs' files cannot mean."""
     model = str(prescription.get("index_model", "dfc"))
@@ -171,9 +171,6 @@ def written_wavelengths(prescription: Mapping[str, Any], where: str) -> tuple[li
     if reference not in waves:
         raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
     return waves, waves.index(reference) + 1
-
-
-_DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
 
 
 def require_same(

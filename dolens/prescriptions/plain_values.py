@@ -31,6 +31,14 @@ _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 # The one in C is written for speed, and reads the same.
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# `.inf` and `.nan` are Python's words but for the point.
+_POINTED = re.compile(r"^([-+]?)\.(inf|nan)$", re.IGNORECASE)
+_INTEGER = re.compile(r"^[-+]?[0-9]+$")
+_DECIMAL = re.compile(
+    r"^[-+]?(?:\.(?:inf|Inf|INF)|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)$|^\.(?:nan|NaN|NAN)$"
+)
+_OTHERS = (f"{_TAG}int", f"{_TAG}float", f"{_TAG}timestamp", f"{_TAG}value")
+_NOTHING = (None, False, 0, "", "ignore")
 
 
 class _PlainLoader(_SafeLoader):
@@ -88,19 +96,12 @@ def _construct_truth(loader: _PlainLoader, node: yaml.ScalarNode) -> bool:
     return bool(loader.bool_values[text.lower()])
 
 
-# `.inf` and `.nan` are Python's words but for the point.
-_POINTED = re.compile(r"^([-+]?)\.(inf|nan)$", re.IGNORECASE)
-_INTEGER = re.compile(r"^[-+]?[0-9]+$")
-_DECIMAL = re.compile(
-    r"^[-+]?(?:\.(?:inf|Inf|INF)|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)$|^\.(?:nan|NaN|NAN)$"
-)
 _PlainLoader.yaml_constructors = {
     f"{_TAG}{name}": yaml.SafeLoader.yaml_constructors[f"{_TAG}{name}"] for name in _TAGS
 } | {None: yaml.SafeLoader.yaml_constructors[None]}
 for _name in ("int", "float"):
     _PlainLoader.add_constructor(f"{_TAG}{_name}", _construct_number)
 _PlainLoader.add_constructor(f"{_TAG}bool", _construct_truth)
-_OTHERS = (f"{_TAG}int", f"{_TAG}float", f"{_TAG}timestamp", f"{_TAG}value")
 _PlainLoader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in found if tag not in _OTHERS]
     for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -303,9 +304,6 @@ def _says(value: Any) -> bool:
     if isinstance(value, dict):
         return any(map(_says, value.values()))
     return any(map(_says, value)) if isinstance(value, list) else value not in _NOTHING
-
-
-_NOTHING = (None, False, 0, "", "ignore")
 
 
 def mapping(value: object, place: str) -> dict[str, Any]:

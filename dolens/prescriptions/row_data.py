@@ -62,6 +62,17 @@ from dolens.prescriptions.numbers import (
 
 # 1e-6/K: of the mount of the air gap behind a surface, or of glass whose catalogue does not say.
 EXPANSION_KEY = "thermal_expansion"
+PHASE_KEY = "phase"
+_PHASE_KEYS = ("type", "order", "efficiency")
+_DEFAULTS = {"order": 1.0, "norm_radius": 1.0}
+BREAK_KIND = CoordinateBreak.kind
+# A tilt that no number of degrees gives to the last bit is written in radians, under this name.
+_RADIANS_OF_BREAKS = tuple(f"{name}_radians" for name in TILTS)
+_BREAK_KEYS = ("type", "thickness", "note", "order", *BREAK, *_RADIANS_OF_BREAKS)
+_OF_SURFACES = ("material", "radius", "curvature", "semi_diameter", "aperture", "obscuration")
+# A tilt that no number of degrees gives to the last bit is written in radians, under this name.
+_RADIANS = tuple(f"{name}_radians" for name in TILTS)
+SENSOR_KEYS = ("distance", "diameter", "radius", "curvature", "conic")
 
 
 def environment_of(prescription: Mapping[str, Any], where: str) -> Environment | None:
@@ -137,11 +148,6 @@ def canonical_digits(material: str) -> str:
         return "/".join(repr(float(part)) for part in parts) if len(parts) > 1 else name
     except ValueError:
         return name
-
-
-PHASE_KEY = "phase"
-_PHASE_KEYS = ("type", "order", "efficiency")
-_DEFAULTS = {"order": 1.0, "norm_radius": 1.0}
 
 
 def phase_from(value: object, place: str, dtype: torch.dtype) -> Phase:
@@ -227,13 +233,6 @@ def without(row: Mapping[str, Any], key: str) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name != key}
 
 
-BREAK_KIND = CoordinateBreak.kind
-# A tilt that no number of degrees gives to the last bit is written in radians, under this name.
-_RADIANS_OF_BREAKS = tuple(f"{name}_radians" for name in TILTS)
-_BREAK_KEYS = ("type", "thickness", "note", "order", *BREAK, *_RADIANS_OF_BREAKS)
-_OF_SURFACES = ("material", "radius", "curvature", "semi_diameter", "aperture", "obscuration")
-
-
 def is_break(row: Mapping[str, Any]) -> bool:
     """Return whether a row of a prescription is a coordinate break."""
     return row.get("type") == BREAK_KIND
@@ -274,10 +273,6 @@ def break_row(surface: CoordinateBreak) -> dict[str, Any]:
     if surface.order != CoordinateBreak.order:
         row["order"] = surface.order
     return row
-
-
-# A tilt that no number of degrees gives to the last bit is written in radians, under this name.
-_RADIANS = tuple(f"{name}_radians" for name in TILTS)
 
 
 def elements_from(value: Any, dtype: torch.dtype, where: str) -> dict[str, Element]:
@@ -338,9 +333,6 @@ def _element(row: Any, dtype: torch.dtype, place: str) -> Element:
         )
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
-
-
-SENSOR_KEYS = ("distance", "diameter", "radius", "curvature", "conic")
 
 
 def sensor_from(prescription: Mapping[str, Any], where: str) -> dict[str, float | None]:

@@ -76,6 +76,14 @@ _TELECENTRIC = 1e4
 _ROUNDED = 1e-4
 # Stands for a stop's semi-diameter (mm) until the pupil decides: within any surface's sag branch.
 _UNDECIDED = 1e-6
+_FIELD_KINDS = ("angles", "heights", "pupil_angles", "image_heights", "real_image_heights")
+_ANGLES = ("angles", "pupil_angles")
+# Kinds of field points on the image, and whether real rays decide.
+_BY_THE_IMAGE = {"image_heights": False, "real_image_heights": True}
+PUBLISHED_KEY = "published"
+_WORDS = ("kind", "note")
+# All others are positive.
+_SIGNED = ("magnification", "bfd")
 
 
 def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -258,12 +266,6 @@ def _stop_of(prescription: Mapping[str, Any], stop: int) -> Mapping[str, Any]:
     return {str(n): row for n, row in prescription["surfaces"].items()}[str(stop)]
 
 
-_FIELD_KINDS = ("angles", "heights", "pupil_angles", "image_heights", "real_image_heights")
-_ANGLES = ("angles", "pupil_angles")
-# Kinds of field points on the image, and whether real rays decide.
-_BY_THE_IMAGE = {"image_heights": False, "real_image_heights": True}
-
-
 def fields_from(value: Any, place: str) -> Fields | None:
     """Read the fields of a prescription, of any kind; None where it has none.
 
@@ -374,12 +376,6 @@ def set_object_fields(lens: Lens) -> Lens:
         points = heights_of_pupil_angles(lens, points)
     lens.fields = fields._replace(kind=kind, points=tuple((x, y) for x, y in points.tolist()))
     return lens
-
-
-PUBLISHED_KEY = "published"
-_WORDS = ("kind", "note")
-# All others are positive.
-_SIGNED = ("magnification", "bfd")
 
 
 def published_from(value: Any, where: str) -> Published | None:

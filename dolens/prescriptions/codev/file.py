@@ -91,6 +91,10 @@ _WORD = re.compile(
     r"""(?P<remark>!.*)|(?P<end>;)|(?P<word>(?:'[^']*(?:'|$)|"[^"]*(?:"|$)|[^\s;!'"])+)"""
 )
 _SURFACE = re.compile(r"S(O|I|[0-9]+)?")
+_NUMBERED = re.compile(r"S(O|I|S|[0-9]+)")
+_MOST_SURFACES = 2000
+# Variables and functions of macros begin with these.
+_VARIABLES = ("^", "@", "(")
 
 
 class Command(NamedTuple):
@@ -174,12 +178,6 @@ def _command(at: int, words: list[str]) -> Command:
     if _SURFACE.fullmatch(key) is None and key[:1] not in ("'", '"'):
         key = key[:3]
     return Command(at, key, words[1:])
-
-
-_NUMBERED = re.compile(r"S(O|I|S|[0-9]+)")
-_MOST_SURFACES = 2000
-# Variables and functions of macros begin with these.
-_VARIABLES = ("^", "@", "(")
 
 
 @dataclass

@@ -32,6 +32,15 @@ _OFFSETS = ("XOD", "YOD", "ZOD")
 _KINDS = ("DAR", "BEN", "REV")
 
 Break = dict[str, Any]
+# Commands of an outline → what a prescription calls them.
+_OUTLINES: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("CIR",): ("semi_diameter",),
+    ("REX", "REY"): ("half_width_x", "half_width_y"),
+    ("ELX", "ELY"): ("semi_axis_x", "semi_axis_y"),
+}
+_KEYS = tuple(key for keys in _OUTLINES for key in keys)
+_CENTER = {"ADX": "decenter_x", "ADY": "decenter_y"}
+_USES = ("CLR", "OBS", "EDG", "HOL")
 
 
 class Axes:
@@ -121,17 +130,6 @@ def _break(move: Break, order: str | None = None) -> Break | None:
 def summed(first: Fraction, second: Fraction, place: str) -> float:
     """Return the double nearest to the sum of two lengths."""
     return nearest(first + second, place)
-
-
-# Commands of an outline → what a prescription calls them.
-_OUTLINES: dict[tuple[str, ...], tuple[str, ...]] = {
-    ("CIR",): ("semi_diameter",),
-    ("REX", "REY"): ("half_width_x", "half_width_y"),
-    ("ELX", "ELY"): ("semi_axis_x", "semi_axis_y"),
-}
-_KEYS = tuple(key for keys in _OUTLINES for key in keys)
-_CENTER = {"ADX": "decenter_x", "ADY": "decenter_y"}
-_USES = ("CLR", "OBS", "EDG", "HOL")
 
 
 def read_apertures(block: Block, factor: Fraction, place: str) -> dict[str, Any]:

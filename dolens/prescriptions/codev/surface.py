@@ -39,6 +39,24 @@ from dolens.prescriptions.other_programs import (
 
 # Coefficients of an asphere, r⁴ to r²⁰.
 LETTERS = powers_of_r("ABCDEFGHJ", range(4, 21, 2))
+_CONIC = Number("conic", 0, ALWAYS, 0.0)
+# Of an odd asphere, a radius of normalisation; 0 means none.
+_ODD_NORM = "SCO C33"
+_NUMBER = re.compile(r"C([1-9]\d?)")
+_ODD_NAME = re.compile(r"AR([1-9]\d?)")
+_NAMES = {
+    "QCN": "a Forbes asphere (Q_con)",
+    "ZRN": "a Zernike surface",
+    "ZFR": "a Zernike surface (Fringe)",
+    "SPN": "a spline surface",
+    "AXI": "an axicon",
+    "SUP": "a superconic surface",
+    "CYL": "a cylinder",
+    "UDS": "a surface of the user's own program",
+}
+_NM = 1e-6
+_MIRRORS = ("REFL",)
+_REFRACTS = ("REFR", "AIR", "")
 
 
 class Special(NamedTuple):
@@ -57,7 +75,6 @@ class Special(NamedTuple):
     what: str = ""
 
 
-_CONIC = Number("conic", 0, ALWAYS, 0.0)
 # The order of the coefficients: Lens System Setup Reference Manual.
 SPECIALS = {
     # Number 1, the conic constant, says nothing on a plane.
@@ -82,22 +99,7 @@ SPECIALS = {
         what=" of an odd asphere",
     ),
 }
-# Of an odd asphere, a radius of normalisation; 0 means none.
-_ODD_NORM = "SCO C33"
 _PHASE = {f"HCO C{n}": Number(f"p{2 * n}", 1 - 2 * n) for n in range(1, 100)}
-_NUMBER = re.compile(r"C([1-9]\d?)")
-_ODD_NAME = re.compile(r"AR([1-9]\d?)")
-_NAMES = {
-    "QCN": "a Forbes asphere (Q_con)",
-    "ZRN": "a Zernike surface",
-    "ZFR": "a Zernike surface (Fringe)",
-    "SPN": "a spline surface",
-    "AXI": "an axicon",
-    "SUP": "a superconic surface",
-    "CYL": "a cylinder",
-    "UDS": "a surface of the user's own program",
-}
-_NM = 1e-6
 
 
 def special_shape(
@@ -217,10 +219,6 @@ def _coefficients(block: Block, key: str, place: str, named: bool = False) -> di
         n = int(number[1]) if number else int(power[1]) + 1 if power else 1
         found[f"{key} C{n}"] = command.words[1]
     return found
-
-
-_MIRRORS = ("REFL",)
-_REFRACTS = ("REFR", "AIR", "")
 
 
 @dataclass(frozen=True)

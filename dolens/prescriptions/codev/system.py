@@ -24,6 +24,16 @@ _PUPILS = ("EPD", "FNO", "NA", "NAO")
 # Degrees Celsius and millimetres of mercury that CODE V's glass data are for.
 _USUAL_TEMPERATURES = (20.0, 22.0)
 _ATMOSPHERE = Fraction(760)
+# What the first of several positions must say as the lens itself does.
+_SYSTEM = ("EPD", "FNO", "NA", "NAO")
+# Lists of wavelengths and fields, one number each; `ZOO WTW W2 1 0` is about the second.
+_LISTS = (
+    "WL",
+    "WTW",
+    "WTF",
+    *(f"{axis}{kind}" for axis in "XY" for kind in ("AN", "OB", "IM", "RI")),
+)
+_LISTED = re.compile(r"[WF]([1-9]\d{0,2})")
 
 
 def factor_to_mm(file: CodeVFile, where: str) -> Fraction:
@@ -179,18 +189,6 @@ def _number(command: Command | None, where: str, factor: Fraction = Fraction(1))
 
 def _last(file: CodeVFile, key: str) -> Command | None:
     return file.system[key][-1] if key in file.system else None
-
-
-# What the first of several positions must say as the lens itself does.
-_SYSTEM = ("EPD", "FNO", "NA", "NAO")
-# Lists of wavelengths and fields, one number each; `ZOO WTW W2 1 0` is about the second.
-_LISTS = (
-    "WL",
-    "WTW",
-    "WTF",
-    *(f"{axis}{kind}" for axis in "XY" for kind in ("AN", "OB", "IM", "RI")),
-)
-_LISTED = re.compile(r"[WF]([1-9]\d{0,2})")
 
 
 def passed_over(file: CodeVFile) -> list[str]:

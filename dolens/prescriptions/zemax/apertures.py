@@ -33,6 +33,8 @@ _NO_EDGE = 1e9
 # Outlines of two numbers: what light passes, and what blocks it.
 _PASSED = {"SQAP": _HALF_WIDTHS, "ELAP": _SEMI_AXES}
 _BLOCKED = {"SQOB": _HALF_WIDTHS, "ELOB": _SEMI_AXES}
+# Each is compared with all others.
+_MOST_POLYGONS = 1000
 
 
 def read_apertures(
@@ -179,10 +181,6 @@ def _words(block: Block, operand: str) -> list[str]:
 def _text(value: object, place: str) -> str:
     number = as_number(value, place)
     return repr(number) if number else "0"
-
-
-# Each is compared with all others.
-_MOST_POLYGONS = 1000
 
 
 def read_polygons(

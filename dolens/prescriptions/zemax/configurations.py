@@ -53,6 +53,24 @@ _OF_WAVELENGTHS: dict[str, tuple[int, tuple[str, ...]]] = {
 _PUPILS = ("OBNA", "ENPD", "FNUM")
 _AIR_OPERANDS = ("TEMP", "PRES")
 _PARAMETER = re.compile(r"PAR(\d)")
+_LISTS = {name for names in _OF_FIELDS.values() for name in names}
+Read = Callable[[ZemaxFile], dict[str, Any]]
+TITLE = "LTTL"
+# What bends no ray: remarks, weights of configurations, mechanical sizes.
+_SILENT = ("MOFF", "MCOM", TITLE, "CWGT", "CHZN", "MCSD", "CSUM", "HOLD")
+# Solves of a surface, whose results hold for the current configuration.
+_SOLVES = (
+    *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PZUP", "PKUP", "PPAR", "PCON"),
+    *("PXDT", "PIKC", "PIKT", "PIKD", "PIKG", "PIKK", "TOLE", "TCOM"),
+)
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+# Lines of a file, once for each of its configurations: so many are read in seconds.
+_MOST_LINES = 1_000_000
+# Operands that are named in a sentence.
+_NAMED = 8
+# Keys of a prescription that a state may have for itself.
+_WAVES = ("wavelengths", "wavelength_weights", "reference_wavelength")
+_KEYS = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS)
 
 
 class Setting(NamedTuple):
@@ -113,9 +131,6 @@ def settings_between(before: ZemaxFile, after: ZemaxFile, place: str) -> dict[Se
             )
     settings = dict.fromkeys((*own, *others))
     return {s: others.get(s, "0.0") for s in settings if own.get(s) != others.get(s)}
-
-
-_LISTS = {name for names in _OF_FIELDS.values() for name in names}
 
 
 def _fixed(lines: Mapping[str, list[Line]], operand: str) -> list[list[str]]:
@@ -204,26 +219,6 @@ def _replace(lines: dict[str, list[Line]], operand: str, place: int, value: str)
         # A size that is set is the user's own, not the program's.
         words[1:2] = ["1"]
     lines[operand] = [*lines[operand][:-1], last._replace(arguments=words, text=" ".join(words))]
-
-
-Read = Callable[[ZemaxFile], dict[str, Any]]
-
-TITLE = "LTTL"
-# What bends no ray: remarks, weights of configurations, mechanical sizes.
-_SILENT = ("MOFF", "MCOM", TITLE, "CWGT", "CHZN", "MCSD", "CSUM", "HOLD")
-# Solves of a surface, whose results hold for the current configuration.
-_SOLVES = (
-    *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PZUP", "PKUP", "PPAR", "PCON"),
-    *("PXDT", "PIKC", "PIKT", "PIKD", "PIKG", "PIKK", "TOLE", "TCOM"),
-)
-_NAME = re.compile(r"[A-Za-z0-9_-]+")
-# Lines of a file, once for each of its configurations: so many are read in seconds.
-_MOST_LINES = 1_000_000
-# Operands that are named in a sentence.
-_NAMED = 8
-# Keys of a prescription that a state may have for itself.
-_WAVES = ("wavelengths", "wavelength_weights", "reference_wavelength")
-_KEYS = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS)
 
 
 def read_configurations(

@@ -50,6 +50,11 @@ SYSTEM_OPERANDS = (
 _MOST_SURFACES = 10_000
 # Not str.splitlines: it also breaks at letters that Latin-1 text may hold.
 _LINE_END = re.compile(r"\r\n|\r|\n")
+# The text of a zero that a writer gives a coefficient which a prescription names.  Zemax lists
+# zeros (`0`, `0.000000000000E+000`) of all coefficients, named or not.
+NAMED_ZERO = "0.0"
+# A node's numbers, and the powers of a length that they are.
+_NODE = {"sag": 1, "slope_x": 0, "slope_y": 0, "twist": -1}
 
 
 class Line(NamedTuple):
@@ -155,11 +160,6 @@ def parse_zemax(text: str, where: str) -> ZemaxFile:
     return file
 
 
-# The text of a zero that a writer gives a coefficient which a prescription names.  Zemax lists
-# zeros (`0`, `0.000000000000E+000`) of all coefficients, named or not.
-NAMED_ZERO = "0.0"
-
-
 @dataclass(frozen=True)
 class SurfaceBlock:
     """A `SurfaceBlock` holds the lines of one surface.
@@ -234,10 +234,6 @@ class SurfaceBlock:
         not give it.
         """
         return scaled(self.slots.get(name, "0"), self.factor**power, f"{self.place}: {name}")
-
-
-# A node's numbers, and the powers of a length that they are.
-_NODE = {"sag": 1, "slope_x": 0, "slope_y": 0, "twist": -1}
 
 
 def read_grid(block: SurfaceBlock) -> dict[str, Any]:

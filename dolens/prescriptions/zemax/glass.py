@@ -69,6 +69,19 @@ _PRODUCT = re.compile(r"(?=.*[A-Z])(?=.*\d)[A-Z0-9_-]{5,}")
 logger = logging.getLogger(__name__)
 
 Pair = tuple[str, str]
+# By how much nd or Vd of a line must miss the glass that it names to be worth a line in the log.
+_FAR_ND, _FAR_VD = 1e-3, 0.5
+# Zemax leaves nd at 1.5, other programs at 0 or 1, where a name says it all.
+_NOT_GIVEN = (0.0, 1.0, 1.5)
+_MODEL, _PICKUP, _OFFSET = "1", "2", "4"
+_BLANK = "___BLANK"
+# Catalogue, series and name, as one supplier of lenses writes them: SCHOTT-BK|N-BK7.
+_QUALIFIED = re.compile(r"([A-Za-z]+)(?:-\w+)?\|(.+)")
+# nd - 1 and Vd in three digits each.
+_CODE = re.compile(r"(\d{3})(\d{2})(\d)")
+_PAIR = re.compile(r"([\d.]+)\s*/\s*([\d.]+)(?:\s*/\s*(\S+))?")
+# ΔPgF that was written for a glass given by nd and Vd alone; what a file may round it to.
+_SAME_DEVIATION = 1e-9
 
 
 def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place: str) -> str:
@@ -218,21 +231,6 @@ def _of(catalogue: str, name: str) -> str:
 def _instead(pair: Pair | None) -> str:
     nd, vd = pair or ("nd", "Vd")
     return f"for a glass by its nd and Vd write GLAS ___BLANK 1 0 {nd} {vd}"
-
-
-# By how much nd or Vd of a line must miss the glass that it names to be worth a line in the log.
-_FAR_ND, _FAR_VD = 1e-3, 0.5
-# Zemax leaves nd at 1.5, other programs at 0 or 1, where a name says it all.
-_NOT_GIVEN = (0.0, 1.0, 1.5)
-_MODEL, _PICKUP, _OFFSET = "1", "2", "4"
-_BLANK = "___BLANK"
-# Catalogue, series and name, as one supplier of lenses writes them: SCHOTT-BK|N-BK7.
-_QUALIFIED = re.compile(r"([A-Za-z]+)(?:-\w+)?\|(.+)")
-# nd - 1 and Vd in three digits each.
-_CODE = re.compile(r"(\d{3})(\d{2})(\d)")
-_PAIR = re.compile(r"([\d.]+)\s*/\s*([\d.]+)(?:\s*/\s*(\S+))?")
-# ΔPgF that was written for a glass given by nd and Vd alone; what a file may round it to.
-_SAME_DEVIATION = 1e-9
 
 
 def read_glass(

@@ -18,6 +18,7 @@ _APERTURES = "further numbers of apertures"
 _FIELDS = "settings of fields"
 _AIR = "temperature and pressure, which the indices do not follow"
 _SYSTEM = "further numbers of the system"
+_AIMING = "ray aiming, which is always on here"
 _NOTHING = (0.0, '""')
 
 # Operand of a surface → what its further words are about, how many words are read, and what
@@ -39,7 +40,7 @@ _NUMBERS_OF_THE_SYSTEM: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "PWAV": (_SYSTEM, 1, ()),
     "WAVM": (_SYSTEM, 3, ()),
     "FTYP": (_FIELDS, 4, ()),
-    "RAIM": ("ray aiming, which is always on here", 2, ("1", "1", "0", "0", "0", "0", "0", "1")),
+    "RAIM": (_AIMING, 2, ("1", "1", "0", "0", "0", "0", "0", "1")),
     "ENVD": (_AIR, 3, ()),
 }
 # Behind the value of a configuration, by newer and by older programs.
@@ -50,6 +51,38 @@ _PARAMETERS = {"STANDARD": range(0), "COORDBRK": range(1, 7)}
 _LEAVES_OUT = 5
 # Temperature (°C) and pressure (atm) that say nothing.
 _USUAL_AIR = (20.0, 1.0)
+# Operands that are not read, by what they are about.  They bend no ray.
+_GROUPS = {
+    _DRAWING: ("MIRR", "SLAB", "SCOL", "DRAW", "SSID", "BOOK", "LAYR", "SUBS"),
+    "mechanical sizes": ("MEMA", "OEMA", "BORD", "MECH", "TPDR"),
+    "coatings": ("COAT",),
+    "scatter models": ("SCAT", "SCSF"),
+    "physical optics": ("POPS", "POPD"),
+    _SOLVES: (
+        *("VDSZ", "VCON", "VPAR", "VCUR", "VXDT", "PPAR", "PZUP", "PKUP", "PCON", "PXDT", "PIKC"),
+        *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PIKT", "PIKD", "PIKG", "PIKK"),
+        *("PIKP", "POSI", "COMP", "COCU", "PUPS", "EVAL", "ZPLM", "TZPL", "CZPL", "XZPL"),
+        *("FSVX", "FSVY"),
+    ),
+    "expansion with temperature": ("TCED", "TCEX", "TCE"),
+    "tolerances": ("TOLE", "TCOM", "UNIF", "QTYP"),
+    "files of its own": ("FIMP", "RAYS"),
+    "apodization": ("GFAC",),
+    "polarization": ("POLS",),
+    _AIMING: ("RAIM", "PUSH", "XAIM", "YAIM", "ZAIM"),
+    "coating and scatter files": ("COFN", "IWDP"),
+    "settings of the program": (
+        *("VERS", "PFIL", "LANG", "ROPD", "PICB", "SDMA", "GLRS", "GSTD", "NSCD", "HYPR", "OMMA"),
+        *("AUTH", "LUID", "EERA", "STUD", "FCOM", "DBDT", "CSUM", "PUPD", "SDIA"),
+    ),
+}
+_GROUP_OF = {operand: group for group, operands in _GROUPS.items() for operand in operands}
+_UNKNOWN = "operands unknown here"
+# What stands there in every file: no physical optics, and light that is not polarized.
+_USUAL_POPS = (*(0.0,) * 8, *(1.0,) * 4)
+_USUAL_POLS = (1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
+# Said of every file, and of no lens.
+_SILENT = ("settings of the program", "coating and scatter files", "mechanical sizes")
 
 
 def further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
@@ -122,52 +155,12 @@ def _number_or_word(word: str) -> float | str:
         return word
 
 
-# Operands that a surface's block may hold, and what they are about.  They bend no ray.
-_OF_SURFACES = {
-    "drawing and colours": ("MIRR", "SLAB", "SCOL", "DRAW", "SSID", "BOOK", "LAYR", "SUBS"),
-    "mechanical sizes": ("MEMA", "OEMA", "BORD", "MECH", "TPDR"),
-    "coatings": ("COAT",),
-    "scatter models": ("SCAT", "SCSF"),
-    "physical optics": ("POPS", "POPD"),
-    "variables and solves, whose results are written": (
-        *("VDSZ", "VCON", "VPAR", "VCUR", "VXDT", "PPAR", "PZUP", "PKUP", "PCON", "PXDT", "PIKC"),
-        *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PIKT", "PIKD", "PIKG", "PIKK"),
-        *("PIKP", "POSI", "COMP", "COCU", "PUPS", "EVAL", "ZPLM", "TZPL", "CZPL", "XZPL"),
-    ),
-    "expansion with temperature": ("TCED", "TCEX", "TCE"),
-    "tolerances": ("TOLE", "TCOM", "UNIF", "QTYP"),
-    "files of its own": ("FIMP", "RAYS"),
-}
-# Operands of the system.
-_OF_THE_SYSTEM = {
-    "apodization": ("GFAC",),
-    "polarization": ("POLS",),
-    "ray aiming, which is always on here": ("RAIM", "PUSH", "XAIM", "YAIM", "ZAIM"),
-    "coating and scatter files": ("COFN", "IWDP"),
-    "variables and solves, whose results are written": ("FSVX", "FSVY"),
-    "settings of the program": (
-        *("VERS", "PFIL", "LANG", "ROPD", "PICB", "SDMA", "GLRS", "GSTD", "NSCD", "HYPR", "OMMA"),
-        *("AUTH", "LUID", "EERA", "STUD", "FCOM", "DBDT", "CSUM", "PUPD", "SDIA"),
-    ),
-}
-_GROUPS = {**_OF_SURFACES}
-for _group, _operands in _OF_THE_SYSTEM.items():
-    _GROUPS[_group] = (*_GROUPS.get(_group, ()), *_operands)
-_GROUP_OF = {operand: group for group, operands in _GROUPS.items() for operand in operands}
-_UNKNOWN = "operands unknown here"
-
-
 def _first_number(line: Line) -> bool:
     return bool(line.arguments) and _number(line.arguments[0]) != 0.0
 
 
 def _any_number(line: Line) -> bool:
     return any(_number(word) for word in line.arguments)
-
-
-# What stands there in every file: no physical optics, and light that is not polarized.
-_USUAL_POPS = (*(0.0,) * 8, *(1.0,) * 4)
-_USUAL_POLS = (1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
 
 
 def _differs(line: Line, usual: tuple[float, ...]) -> bool:
@@ -188,8 +181,6 @@ _SAYS: dict[str, Callable[[Line], bool]] = {
     "PUSH": _any_number,
     "SCOL": _first_number,
 }
-# Said of every file, and of no lens.
-_SILENT = ("settings of the program", "coating and scatter files", "mechanical sizes")
 
 
 def passed_over(file: ZemaxFile) -> list[str]:

@@ -66,6 +66,10 @@ _BEFORE, _AFTER, _RETURN = "1", "2", "3"
 _SAME, _REVERSED = 1.0, 2.0
 # Behind the kind: order and status.
 _NUMBERS = 3
+# Zemax writes INFINITY, and takes any distance from here on for it.
+_INFINITE = 1e10
+GlassReader = Callable[..., str]
+Block = Mapping[str, list[Line]]
 
 
 def own_axes(block: SurfaceBlock) -> tuple[Row | None, Row | None]:
@@ -118,14 +122,6 @@ def _axes_row(block: SurfaceBlock, words: list[str], place: str) -> Row | None:
 
 def _numbers(row: Row | None) -> dict[str, float]:
     return {name: row[name] for name in BREAK if name in row} if row else {}
-
-
-# Zemax writes INFINITY, and takes any distance from here on for it.
-_INFINITE = 1e10
-
-GlassReader = Callable[..., str]
-
-Block = Mapping[str, list[Line]]
 
 
 def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:

@@ -39,6 +39,8 @@ from dolens.prescriptions.zemax.table import (
 # Terms of a list in XDAT.
 _MOST = 240
 _PLAIN_KINDS = ("plane", "sphere", "conic")
+_MONOMIALS = monomials(20)
+_NORM_RADIUS = Number("norm_radius", 1, RADIUS, 1.0)
 
 
 def _parm(*numbers: int) -> tuple[str, ...]:
@@ -56,10 +58,8 @@ def _powers(step: int) -> dict[str, Number]:
     return powers_of_r(slots, range(step, step * _MOST + 1, step))
 
 
-# The coefficients of r² to r¹⁶, and monomials to the 20th degree.
+# The coefficients of r² to r¹⁶.
 _EVEN = powers_of_r(_parm(*range(1, 9)), range(2, 17, 2))
-_MONOMIALS = monomials(20)
-_NORM_RADIUS = Number("norm_radius", 1, RADIUS, 1.0)
 
 
 def _read_standard(shape: ZemaxShape, block: SurfaceBlock) -> Row:

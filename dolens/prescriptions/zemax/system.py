@@ -32,6 +32,11 @@ VIGNETTING_OPERANDS = (
     ("angle", "VANN", "ZVAN"),
 )
 _MICROMETRE = Fraction(1000)
+_UNITS = {"MM": Fraction(1), "CM": Fraction(10), "IN": Fraction(127, 5), "METER": Fraction(1000)}
+# Temperature and pressure, and what a file without ENVD means by them.
+_USUAL_AIR = {"TEMP": 20.0, "PRES": 1.0}
+# Lines round what ENVD says to a dozen digits.
+_SAME_AIR = 1e-6
 
 
 def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
@@ -176,9 +181,6 @@ def _numbers(line: Line, unit: Fraction, where: str) -> list[float]:
     return [scaled(w, unit if at < 2 else Fraction(1), place) for at, w in enumerate(words[:8])]
 
 
-_UNITS = {"MM": Fraction(1), "CM": Fraction(10), "IN": Fraction(127, 5), "METER": Fraction(1000)}
-
-
 def factor_to_mm(file: ZemaxFile, where: str) -> Fraction:
     """Return millimetres in the file's unit of length; millimetres where it names none."""
     line = last(file, "UNIT")
@@ -278,12 +280,6 @@ def _air(file: ZemaxFile, where: str) -> dict[str, float]:
     place = f"{where}: line {line.at}: ENVD"
     temperature, pressure = (number_in_text(word, place) for word in line.arguments[:2])
     return {"temperature": temperature, "pressure": pressure}
-
-
-# Temperature and pressure, and what a file without ENVD means by them.
-_USUAL_AIR = {"TEMP": 20.0, "PRES": 1.0}
-# Lines round what ENVD says to a dozen digits.
-_SAME_AIR = 1e-6
 
 
 def refuse_own_air(file: ZemaxFile, where: str) -> None:

@@ -29,6 +29,16 @@ from dolens.prescriptions.zemax.shapes import shape_of_row
 from dolens.prescriptions.zemax.system import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
 from dolens.prescriptions.zemax.table import conic_line, curvature_line
 
+# Fields in the lists; further ones have lines of their own.
+_LISTED = 12
+_ALWAYS = ("wavelengths", "reference_wavelength", "fields")
+_PUPILS = {
+    "entrance_pupil_diameter": "ENPD {}",
+    "f_number": "FNUM {} 0",
+    "working_f_number": "FNUM {} 1",
+    "object_na": "OBNA {} 0",
+}
+
 
 def configurations_of(
     prescription: Mapping[str, Any], write: Callable[[Mapping[str, Any]], str], where: str
@@ -81,10 +91,6 @@ def configurations_of(
                 f'{setting.parameter} 0 1 1 1 0 0 "" 0'
             )
     return lines
-
-
-# Fields in the lists; further ones have lines of their own.
-_LISTED = 12
 
 
 def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
@@ -166,15 +172,6 @@ def _image_shape(sensor: Mapping[str, Any], where: str) -> list[str]:
         return ["  CURV 0.0"]
     conic = [f"  {conic_line(sensor, f'{where}: sensor')}"] if sensor.get("conic") else []
     return [f"  {curvature_line(sensor, f'{where}: sensor')}", *conic]
-
-
-_ALWAYS = ("wavelengths", "reference_wavelength", "fields")
-_PUPILS = {
-    "entrance_pupil_diameter": "ENPD {}",
-    "f_number": "FNUM {} 0",
-    "working_f_number": "FNUM {} 1",
-    "object_na": "OBNA {} 0",
-}
 
 
 def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where: str) -> list[str]:
