@@ -35,7 +35,7 @@ COMPARED_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700
 def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
     """Take the only index model that the files of other programs know."""
     model = str(prescription.get("index_model", "dfc"))
-    if not of_other_program(new) or model == "dfc":
+    if not _of_other_program(new) or model == "dfc":
         return []
     prescription["index_model"] = "dfc"
     return [
@@ -62,18 +62,18 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
             near = parse_material(pair, model)
         except InputError:
             continue
-        waves = compared_wavelengths(medium)
+        waves = _compared_wavelengths(medium)
         error = max(abs(float(medium.index(w)) - float(near.index(w))) for w in waves)
         said.setdefault(name, (pair, error, waves, []))[3].append(str(n))
         row["material"] = pair
     return [
-        f"the glass {name} behind {surfaces_text(numbers)} became {pair} (nd/Vd): its index "
+        f"the glass {name} behind {_surfaces_text(numbers)} became {pair} (nd/Vd): its index "
         f"differs by up to {error:.1g} from {waves[0]:g} to {waves[-1]:g} nm"
         for name, (pair, error, waves, numbers) in said.items()
     ]
 
 
-def compared_wavelengths(medium: Medium) -> Sequence[float]:
+def _compared_wavelengths(medium: Medium) -> Sequence[float]:
     """Return where the indices of a medium are compared, nm: as far as its data go.
 
     Args:
@@ -100,7 +100,7 @@ def _needs_numbers(name: str, new: str) -> bool:
 
 def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
     """Write aperture planes as other programs know them: the stop is one, any other is a plane."""
-    if not of_other_program(new):
+    if not _of_other_program(new):
         return []
     said = []
     stop = str(prescription.get("stop", 1))
@@ -143,7 +143,7 @@ def _without_notes(prescription: Prescription, new: str) -> list[str]:
     noted = [str(n) for n, row in prescription["surfaces"].items() if row.pop("note", None)]
     if not noted:
         return []
-    return [f"lost: {'remarks' if len(noted) > 1 else 'the remark'} on {surfaces_text(noted)}"]
+    return [f"lost: {'remarks' if len(noted) > 1 else 'the remark'} on {_surfaces_text(noted)}"]
 
 
 def _without_source(prescription: Prescription, new: str) -> list[str]:
@@ -188,7 +188,7 @@ SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
 )
 
 
-def of_other_program(path: str) -> bool:
+def _of_other_program(path: str) -> bool:
     """Return whether a file is named as one of Zemax or CODE V."""
     return _suffix(path) in (".zmx", ".seq")
 
@@ -205,7 +205,7 @@ def _is_flat(row: Mapping[str, Any]) -> bool:
     return abs(float(row.get("radius", 0.0))) == float("inf")
 
 
-def surfaces_text(numbers: list[str]) -> str:
+def _surfaces_text(numbers: list[str]) -> str:
     """Return `surface 3`, or `surfaces 1, 2 and 3`."""
     if len(numbers) == 1:
         return f"surface {numbers[0]}"
@@ -312,7 +312,9 @@ def _sentences(found: list[Difference], new: str) -> list[str]:
     for place, key, before, after in found:
         if before is None:
             what = f"added: {key} {_shown(after)}" + (
-                f", which a {PurePath(new).suffix} file always has" if of_other_program(new) else ""
+                f", which a {PurePath(new).suffix} file always has"
+                if _of_other_program(new)
+                else ""
             )
         elif after is None:
             what = f"lost: {key} {_shown(before)}"
@@ -325,7 +327,7 @@ def _sentences(found: list[Difference], new: str) -> list[str]:
     for (what, kind), places in groups.items():
         where = {"": "", "sensor": "sensor: "}.get(kind)
         if where is None:
-            where = f"{surfaces_text([place.partition(' ')[2] for place in places])}: "
+            where = f"{_surfaces_text([place.partition(' ')[2] for place in places])}: "
         sentences.append(where + what)
     return sentences
 
@@ -354,7 +356,7 @@ def _parameters(lens: Lens) -> dict[str, torch.Tensor]:
 
 def _indices(lens: Lens) -> list[list[float]]:
     media = lens.system().materials
-    return [[float(m.index(wave)) for wave in compared_wavelengths(m)] for m in media]
+    return [[float(m.index(wave)) for wave in _compared_wavelengths(m)] for m in media]
 
 
 @torch.no_grad()

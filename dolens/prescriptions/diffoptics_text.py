@@ -192,7 +192,7 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
         raise InputError(f"{place}: a row of type {letter} ends with its material")
     distance = number_in_text(words[1], f"{place}: 'distance'")
     diameter = number_in_text(words[3], f"{place}: 'diameter'")
-    return letter, (distance, diameter), diffoptics_material(words[4], place)
+    return letter, (distance, diameter), _diffoptics_material(words[4], place)
 
 
 def _shape(letter: str, words: list[str], said: Mapping[str, Any], place: str) -> dict[str, Any]:
@@ -243,7 +243,7 @@ def _line(
     name = str(material)
     written = name.upper() if name in ("air", "occluder") else name
     try:
-        held = diffoptics_material(written, place) == name
+        held = _diffoptics_material(written, place) == name
     except InputError:
         held = False
     if not held:
@@ -309,7 +309,7 @@ DIFFOPTICS_GLASSES = {
 }
 
 
-def diffoptics_material(name: str, place: str) -> str:
+def _diffoptics_material(name: str, place: str) -> str:
     """Return a medium of the diffoptics format as a prescription writes it.
 
     A name stands for diffoptics's own nd and Vd, not for a catalogue's dispersion.  Vacuum is the

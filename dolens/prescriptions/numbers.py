@@ -177,11 +177,11 @@ def radius_row(curvature: float) -> dict[str, float]:
     """Return `radius` as a file's row has it, with the fewest digits, or `curvature` where no
     radius means its last bit.
     """
-    radius = radius_of(curvature)
+    radius = _radius_of(curvature)
     return {"curvature": curvature} if radius is None else {"radius": radius}
 
 
-def radius_of(curvature: float) -> float | None:
+def _radius_of(curvature: float) -> float | None:
     """Return the radius with the fewest digits whose reciprocal is the curvature; None if there is
     none.
 

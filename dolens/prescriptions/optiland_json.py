@@ -126,7 +126,7 @@ def _row(surface: dict[str, Any], stop: bool, before: str, place: str) -> dict[s
         row = _shape(geometry, place)
     if row == {"type": "plane"} and stop and material == before:
         row = {"type": "aperture"}
-    return row | {"material": material} | aperture_row(surface.get("aperture"), place)
+    return row | {"material": material} | _aperture_row(surface.get("aperture"), place)
 
 
 def _ideal_lens(
@@ -291,7 +291,7 @@ def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
     return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
 
 
-def aperture_row(content: object, place: str) -> dict[str, Any]:
+def _aperture_row(content: object, place: str) -> dict[str, Any]:
     """Return a surface's clear aperture as a prescription's row has it.
 
     Raises:

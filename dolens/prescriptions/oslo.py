@@ -104,7 +104,7 @@ class OsloFile:
     passed_over: dict[str, dict[str, None]] = field(default_factory=dict)
 
 
-def parse_oslo(text: str, where: str) -> OsloFile:
+def _parse_oslo(text: str, where: str) -> OsloFile:
     """Sort the lines of a `.len` file.
 
     Raises:
@@ -162,7 +162,7 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     Raises:
         InputError: one line that names `where`, the surface or line, and what is not held.
     """
-    file = parse_oslo(text, where)
+    file = _parse_oslo(text, where)
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image")
     factor = _factor(file, where)

@@ -38,7 +38,7 @@ that a surface's has) is curved: rays end where they meet it.  `diameter` is the
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -67,11 +67,9 @@ _PHASE_KEYS = ("type", "order", "efficiency")
 _DEFAULTS = {"order": 1.0, "norm_radius": 1.0}
 BREAK_KIND = CoordinateBreak.kind
 # A tilt that no number of degrees gives to the last bit is written in radians, under this name.
-_RADIANS_OF_BREAKS = tuple(f"{name}_radians" for name in TILTS)
-_BREAK_KEYS = ("type", "thickness", "note", "order", *BREAK, *_RADIANS_OF_BREAKS)
-_OF_SURFACES = ("material", "radius", "curvature", "semi_diameter", "aperture", "obscuration")
-# A tilt that no number of degrees gives to the last bit is written in radians, under this name.
 _RADIANS = tuple(f"{name}_radians" for name in TILTS)
+_BREAK_KEYS = ("type", "thickness", "note", "order", *BREAK, *_RADIANS)
+_OF_SURFACES = ("material", "radius", "curvature", "semi_diameter", "aperture", "obscuration")
 SENSOR_KEYS = ("distance", "diameter", "radius", "curvature", "conic")
 
 
@@ -250,26 +248,12 @@ def break_from(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Coordi
     check_keys(row, _BREAK_KEYS, place)
     order = str(row.get("order", CoordinateBreak.order))
     check_choice(order, BREAKS, f"{place}: 'order'")
-    numbers = {}
-    for name in BREAK:
-        numbers[name] = to_lens_units(name, as_number(row.get(name, 0.0), f"{place}: '{name}'"))
-        radians = f"{name}_radians"
-        if radians in row:
-            if name in row:
-                raise InputError(f"{place}: give '{name}' or '{radians}', not both")
-            numbers[name] = as_number(row[radians], f"{place}: '{radians}'")
-    return BREAKS[order](numbers, dtype)
+    return BREAKS[order](_pose(row, BREAK, place), dtype)
 
 
 def break_row(surface: CoordinateBreak) -> dict[str, Any]:
     """Return the row that `break_from` reads back to the same parameters, to the last bit."""
-    row: dict[str, Any] = {"type": BREAK_KIND}
-    for name, value in surface.named_parameters():
-        number = float(value.detach())
-        if number == 0.0:
-            continue
-        written = file_value(name, number)
-        row |= {f"{name}_radians": number} if written is None else {name: written}
+    row: dict[str, Any] = {"type": BREAK_KIND, **_pose_row(surface)}
     if surface.order != CoordinateBreak.order:
         row["order"] = surface.order
     return row
@@ -293,13 +277,7 @@ def element_rows(elements: Mapping[str, Element]) -> dict[str, dict[str, Any]]:
     """Return rows that `elements_from` reads back to the same parameters, to the last bit."""
     rows = {}
     for name, element in elements.items():
-        row: dict[str, Any] = {"surfaces": [element.first, element.last]}
-        for key, value in element.named_parameters():
-            number = float(value.detach())
-            if number == 0.0:
-                continue
-            written = file_value(key, number)
-            row |= {f"{key}_radians": number} if written is None else {key: written}
+        row: dict[str, Any] = {"surfaces": [element.first, element.last], **_pose_row(element)}
         if any(element.pivot):
             row["pivot"] = list(element.pivot)
         rows[name] = row
@@ -314,25 +292,40 @@ def _element(row: Any, dtype: torch.dtype, place: str) -> Element:
         raise InputError(f"{place}: 'surfaces' must be [first, last], not {surfaces!r}")
     if not isinstance(pivot, list | tuple) or len(pivot) != 3:
         raise InputError(f"{place}: 'pivot' must be [x, y, z] in mm, not {pivot!r}")
-    pose = {}
-    for name in TILTS:
-        if f"{name}_radians" in row and name in row:
-            raise InputError(f"{place}: give '{name}' or '{name}_radians', not both")
-        pose[name] = to_lens_units(name, as_number(row.get(name, 0.0), f"{place}: '{name}'"))
-        if f"{name}_radians" in row:
-            pose[name] = as_number(row[f"{name}_radians"], f"{place}: '{name}_radians'")
-    for name in DISPLACEMENTS:
-        pose[name] = as_number(row.get(name, 0.0), f"{place}: '{name}'")
     try:
         return Element(
             as_integer(surfaces[0], "'surfaces'"),
             as_integer(surfaces[1], "'surfaces'"),
-            pose,
+            _pose(row, (*TILTS, *DISPLACEMENTS), place),
             [as_number(entry, "'pivot'") for entry in pivot],
             dtype,
         )
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
+
+
+def _pose(row: Mapping[str, Any], names: Iterable[str], place: str) -> dict[str, float]:
+    """Return tilts (radians) and decenters (mm) of a row; what it does not say is zero."""
+    found = {}
+    for name in names:
+        radians = f"{name}_radians"
+        if name in row and radians in row:
+            raise InputError(f"{place}: give '{name}' or '{radians}', not both")
+        found[name] = to_lens_units(name, as_number(row.get(name, 0.0), f"{place}: '{name}'"))
+        if radians in row:
+            found[name] = as_number(row[radians], f"{place}: '{radians}'")
+    return found
+
+
+def _pose_row(moved: torch.nn.Module) -> dict[str, float]:
+    """Return the numbers that `_pose` reads back, of all that are not zero."""
+    row: dict[str, float] = {}
+    for name, value in moved.named_parameters():
+        number = float(value.detach())
+        written = file_value(name, number)
+        if number != 0.0:
+            row |= {f"{name}_radians": number} if written is None else {name: written}
+    return row
 
 
 def sensor_from(prescription: Mapping[str, Any], where: str) -> dict[str, float | None]:

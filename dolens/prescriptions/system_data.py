@@ -114,7 +114,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
             )
     weights = prescription.get("wavelength_weights")
     if weights is not None:
-        weights = weights_from(weights, len(wavelengths or ()), f"{where}: 'wavelength_weights'")
+        weights = _weights_from(weights, len(wavelengths or ()), f"{where}: 'wavelength_weights'")
     air = {}
     for key in ("temperature", "pressure"):
         value = prescription.get(key)
@@ -128,7 +128,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     distance = prescription.get("object_distance")
     if distance is not None:
         distance = as_positive(distance, f"{where}: 'object_distance'")
-    fields = fields_from(prescription.get("fields"), f"{where}: fields")
+    fields = _fields_from(prescription.get("fields"), f"{where}: fields")
     if fields is not None and fields.kind == "heights" and distance is None:
         raise InputError(f"{where}: 'fields.heights' need an 'object_distance' (mm)")
     if fields is not None and fields.kind == "angles" and vergence(distance) != 0.0:
@@ -266,7 +266,7 @@ def _stop_of(prescription: Mapping[str, Any], stop: int) -> Mapping[str, Any]:
     return {str(n): row for n, row in prescription["surfaces"].items()}[str(stop)]
 
 
-def fields_from(value: Any, place: str) -> Fields | None:
+def _fields_from(value: Any, place: str) -> Fields | None:
     """Read the fields of a prescription, of any kind; None where it has none.
 
     Raises:
@@ -299,7 +299,7 @@ def fields_from(value: Any, place: str) -> Fields | None:
         found.append((x, y))
     weights, vignetting = value.get("weights"), value.get("vignetting")
     if weights is not None:
-        weights = tuple(weights_from(weights, len(found), f"{place}: 'weights'"))
+        weights = tuple(_weights_from(weights, len(found), f"{place}: 'weights'"))
     if vignetting is not None:
         if not isinstance(vignetting, list | tuple) or len(vignetting) != len(found):
             raise InputError(f"{place}: 'vignetting' must be a list of {len(found)}, one a field")
@@ -318,7 +318,7 @@ def _vignetting(value: Any, place: str) -> Vignetting:
     return found
 
 
-def weights_from(value: Any, count: int, place: str) -> list[float]:
+def _weights_from(value: Any, count: int, place: str) -> list[float]:
     """Read as many weights: numbers that are not negative, of any positive sum."""
     if not isinstance(value, list | tuple) or len(value) != count:
         raise InputError(f"{place} must be a list of {count} numbers")
@@ -341,12 +341,12 @@ def unequal_weights(
         return {}
     if len(values) < count:
         raise InputError(f"{place} gives {len(values)} weights for {count}")
-    found = weights_from(list(values[:count]), count, place)
+    found = _weights_from(list(values[:count]), count, place)
     return {key: found} if len(set(found)) > 1 else {}
 
 
 def field_rows(fields: Fields) -> dict[str, Any]:
-    """Return the mapping that `fields_from` reads back."""
+    """Return the mapping that `_fields_from` reads back."""
     rows: dict[str, Any] = {fields.kind: [list(point) for point in fields.points]}
     if fields.weights is not None:
         rows["weights"] = list(fields.weights)

@@ -102,7 +102,7 @@ SPECIALS = {
 _PHASE = {f"HCO C{n}": Number(f"p{2 * n}", 1 - 2 * n) for n in range(1, 100)}
 
 
-def special_shape(
+def _special_shape(
     block: Block, size: dict[str, float], factor: Fraction, place: str
 ) -> dict[str, Any]:
     """Return the row of a special surface.
@@ -145,7 +145,7 @@ def special_shape(
 
 
 def special_lines(row: Mapping[str, Any], place: str) -> list[str]:
-    """Return the lines that `special_shape` reads back; nothing of another type.
+    """Return the lines that `_special_shape` reads back; nothing of another type.
 
     Raises:
         InputError: a coefficient has no place in CODE V's numbering.
@@ -330,7 +330,7 @@ def _shape(
     if any(exact(word, f"{place}: CUF") for word in block.said("CUF")):
         raise InputError(f"{place}: a Fresnel surface is not held (CUF)")
     if "SPS" in block.commands:
-        return special_shape(block, size, factor, place)
+        return _special_shape(block, size, factor, place)
     if "ASP" in block.commands or any(key in block.commands for key in LETTERS):
         conic = {"conic": conic_constant(block, place)}
         return {"type": "even_asphere", **_given(size), **conic} | _powers(block, factor, place)

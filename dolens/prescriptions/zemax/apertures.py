@@ -85,10 +85,10 @@ def read_apertures(
     if "SPID" in block:
         return found | {"obscuration": _spider(block, factor, place) | beside}, True
     if "USAP" in block:
-        drawn_by_user = {"polygons": read_polygons(block, factor, f"{place}: USAP")}
+        drawn_by_user = {"polygons": _read_polygons(block, factor, f"{place}: USAP")}
         return (found if stop else {}) | {"aperture": drawn_by_user | beside}, True
     if "USOB" in block:
-        drawn_by_user = {"polygons": read_polygons(block, factor, f"{place}: USOB")}
+        drawn_by_user = {"polygons": _read_polygons(block, factor, f"{place}: USOB")}
         return found | {"obscuration": drawn_by_user | beside}, True
     for operand, keys in _BLOCKED.items():
         if operand in block:
@@ -146,7 +146,7 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
         lines.append(f"OBDC {' '.join(_text(value, place) for value in center)}")
     drawn = outline.get("polygons") or hole.get("polygons")
     if drawn:
-        lines += polygon_lines(drawn, place)
+        lines += _polygon_lines(drawn, place)
     return [f"  {line}" for line in lines]
 
 
@@ -183,7 +183,7 @@ def _text(value: object, place: str) -> str:
     return repr(number) if number else "0"
 
 
-def read_polygons(
+def _read_polygons(
     block: Mapping[str, list[Line]], factor: Fraction, place: str
 ) -> list[list[list[float]]]:
     """Return the corners of the polygons of a surface, mm.
@@ -223,8 +223,8 @@ def read_polygons(
     return polygons
 
 
-def polygon_lines(polygons: Sequence[Sequence[Sequence[float]]], place: str) -> list[str]:
-    """Return the lines that `read_polygons` reads back.
+def _polygon_lines(polygons: Sequence[Sequence[Sequence[float]]], place: str) -> list[str]:
+    """Return the lines that `_read_polygons` reads back.
 
     Raises:
         InputError: a corner at 0, 0, which would end its polygon.

@@ -148,7 +148,7 @@ def _last_words(lines: Mapping[str, list[Line]], operand: str) -> list[str]:
     return lines[operand][-1].arguments if operand in lines else []
 
 
-def apply_setting(file: ZemaxFile, line: Line) -> None:
+def _apply_setting(file: ZemaxFile, line: Line) -> None:
     """Put the number of a line behind MNUM into its place among the surfaces and the system.
 
     Raises:
@@ -336,7 +336,7 @@ def _of_configuration(
         surfaces=[{key: [*lines] for key, lines in block.items()} for block in file.surfaces],
     )
     for line in settings:
-        apply_setting(there, line)
+        _apply_setting(there, line)
     found = read(there)
     _refuse_other_structure(lens, found)
     return found

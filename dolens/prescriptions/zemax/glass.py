@@ -84,7 +84,7 @@ _PAIR = re.compile(r"([\d.]+)\s*/\s*([\d.]+)(?:\s*/\s*(\S+))?")
 _SAME_DEVIATION = 1e-9
 
 
-def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place: str) -> str:
+def _named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place: str) -> str:
     """Return catalogue and name of the glass that a file means.
 
     Args:
@@ -102,7 +102,7 @@ def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, 
         return _without_catalogues(name, having, pair, place)
     doubtful: list[str] = []
     for catalogue in catalogues:
-        known = known_catalogue(catalogue)
+        known = _known_catalogue(catalogue)
         if known in having:
             found = _of(known, name)
             # Schott's own glass of that name, where GCAT names Schott first, had this nd and Vd.
@@ -114,10 +114,10 @@ def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, 
                     f"have another glass of that name that is not known here; {_instead(pair)}"
                 )
             return found
-        if may_have(known, name):
+        if _may_have(known, name):
             doubtful.append(catalogue)
     agreeing = [c for c in having if pair and _agrees(_of(c, name), pair)]
-    unknown = [catalogue for catalogue in catalogues if known_catalogue(catalogue) is None]
+    unknown = [catalogue for catalogue in catalogues if _known_catalogue(catalogue) is None]
     owner = agreeing[0] if agreeing else _owner(name) if pair is None else None
     if unknown and owner:
         return _of(owner, name)
@@ -150,7 +150,7 @@ def _without_catalogues(name: str, having: Sequence[str], pair: Pair | None, pla
         ) from None
 
 
-def known_catalogue(catalogue: str) -> str | None:
+def _known_catalogue(catalogue: str) -> str | None:
     """Return the catalogue here that a word of GCAT means; editions have a suffix."""
     word = catalogue.upper()
     names = known_catalogues()
@@ -162,7 +162,7 @@ def known_catalogue(catalogue: str) -> str | None:
     return next((m for w, m in editions.items() if re.fullmatch(rf"{w}[-_\d].*", word)), None)
 
 
-def may_have(known: str | None, name: str) -> bool:
+def _may_have(known: str | None, name: str) -> bool:
     """Return whether a catalogue may have a glass of that name, which is not known here.
 
     Schott's table lacks what Schott had given up by 2006.  A catalogue that is not known may have
@@ -173,14 +173,14 @@ def may_have(known: str | None, name: str) -> bool:
     return known == "SCHOTT" and is_old_name(name)
 
 
-def may_have_another(known: str, name: str, glass: str) -> bool:
+def _may_have_another(known: str, name: str, glass: str) -> bool:
     """Return whether a catalogue may have a glass of that name that differs from the one of another
     catalogue.
 
     Schott's own SSK4 had the nd and Vd of Sumita's: there either will do.
     """
     lost = _LOST.get(name.upper()) if known == "SCHOTT" else None
-    return may_have(known, name) and not (lost and _agrees(glass, lost))
+    return _may_have(known, name) and not (lost and _agrees(glass, lost))
 
 
 def _owner(name: str) -> str | None:
@@ -196,7 +196,7 @@ def _owner(name: str) -> str | None:
 
 def _near(name: str, catalogues: Sequence[str]) -> str:
     """Return `; did you mean ...` of glasses in the file's known catalogues, or nothing."""
-    known = [found for catalogue in catalogues if (found := known_catalogue(catalogue))]
+    known = [found for catalogue in catalogues if (found := _known_catalogue(catalogue))]
     return suggestion(name, [glass for catalogue in known for glass in glass_names(catalogue)])
 
 
@@ -204,7 +204,7 @@ def _agrees(found: str, pair: Pair) -> bool | None:
     """Return whether a glass has that nd and Vd; None where it has none, for example in the
     infrared.
     """
-    own = index_and_abbe_number(find_glass(found))
+    own = _index_and_abbe_number(find_glass(found))
     if own is None:
         return None
     printed = zip(own, pair, (_ND, _VD), strict=True)
@@ -216,7 +216,7 @@ def _half_unit(text: str) -> float:
     return 0.5 * 10.0 ** int(Decimal(text).as_tuple().exponent)
 
 
-def index_and_abbe_number(medium: Medium) -> tuple[float, float] | None:
+def _index_and_abbe_number(medium: Medium) -> tuple[float, float] | None:
     """Return nd and Vd; None of a medium whose range ends short of the lines F, d and C."""
     try:
         return index_d(medium), abbe_number(medium)
@@ -271,9 +271,9 @@ def read_glass(
     if code and not makers_of(name):
         return _with_vd(f"1.{code[1]}", f"{int(code[2])}.{code[3]}", "0")
     qualified = _QUALIFIED.fullmatch(name)
-    if qualified and known_catalogue(qualified[1]):
+    if qualified and _known_catalogue(qualified[1]):
         name, catalogues = qualified[2], [qualified[1]]
-    found = named_glass(name, catalogues, pair, place)
+    found = _named_glass(name, catalogues, pair, place)
     _compare(found, pair, place)
     return found
 
@@ -292,7 +292,7 @@ def glass_line(material: object, place: str) -> list[str]:
         return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
     _, colon, word = name.partition(":")
     if colon:
-        nd, vd = index_and_abbe_number(medium) or (1.5, 40.0)
+        nd, vd = _index_and_abbe_number(medium) or (1.5, 40.0)
         vd = vd if abs(vd) < 1e4 else 0.0
         return [f"  GLAS {word} 0 0 {nd:.8f} {vd:.6f} 0 0 0 0 0 0"]
     pair = _PAIR.fullmatch(name)
@@ -315,7 +315,7 @@ def catalogue_line(materials: Sequence[object], where: str) -> list[str]:
         return []
 
     def must_precede(catalogue: str, word: str, other: str) -> bool:
-        return other in makers_of(word) or may_have_another(other, word, f"{catalogue}:{word}")
+        return other in makers_of(word) or _may_have_another(other, word, f"{catalogue}:{word}")
 
     order = catalogue_order(glasses, must_precede)
     if order is None:
@@ -374,7 +374,7 @@ def _printed(words: Sequence[str], place: str) -> Pair | None:
 
 def _compare(found: str, pair: Pair | None, place: str) -> None:
     """Log that nd and Vd of a line are not those of the glass that it names, if they are far."""
-    own = index_and_abbe_number(find_glass(found)) if pair else None
+    own = _index_and_abbe_number(find_glass(found)) if pair else None
     if pair is None or own is None:
         return
     nd, vd = (float(text) for text in pair)

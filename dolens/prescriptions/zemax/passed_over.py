@@ -85,7 +85,7 @@ _USUAL_POLS = (1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
 _SILENT = ("settings of the program", "coating and scatter files", "mechanical sizes")
 
 
-def further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
+def _further_numbers(file: ZemaxFile) -> Iterator[tuple[str, str]]:
     """Yield what such numbers are about, and their operand, of all that say something."""
     for operand, (group, read, usual) in _NUMBERS_OF_THE_SYSTEM.items():
         for line in file.system.get(operand, []):
@@ -196,7 +196,7 @@ def passed_over(file: ZemaxFile) -> list[str]:
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):
             groups.setdefault(group, {})[operand] = None
-    for group, operand in further_numbers(file):
+    for group, operand in _further_numbers(file):
         groups.setdefault(group, {})[operand] = None
     for number, block in enumerate(file.surfaces):
         if any(line.arguments[:1] == [JONES_MATRIX.type] for line in block.get("TYPE", [])):

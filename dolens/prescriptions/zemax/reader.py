@@ -72,7 +72,7 @@ GlassReader = Callable[..., str]
 Block = Mapping[str, list[Line]]
 
 
-def own_axes(block: SurfaceBlock) -> tuple[Row | None, Row | None]:
+def _own_axes(block: SurfaceBlock) -> tuple[Row | None, Row | None]:
     """Return the rows of the breaks before and after a surface, None where nothing moves.
 
     Raises:
@@ -170,7 +170,7 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
         row, clips = _row(block, glass, pupil)
-        before, after = own_axes(block)
+        before, after = _own_axes(block)
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
             medium = row["material"]
@@ -307,7 +307,7 @@ def _with_sensor(
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
-    before, _ = own_axes(block)
+    before, _ = _own_axes(block)
     if before is not None:
         rows[-1]["thickness"], gaps = math.fsum(gaps), [0.0]
         rows.append(before)
@@ -345,7 +345,7 @@ def _object(
     block = SurfaceBlock(file.surfaces[0], factor, place)
     if block.type != "STANDARD":
         raise InputError(f"{place}: must be a plane of TYPE STANDARD, not {block.type}")
-    if any(own_axes(block)):
+    if any(_own_axes(block)):
         raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")
     medium = glass(block.words("GLAS"), place=place)
     words = block.words("DISZ")

@@ -39,13 +39,13 @@ _USUAL_AIR = {"TEMP": 20.0, "PRES": 1.0}
 _SAME_AIR = 1e-6
 
 
-def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
+def _read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
     """Read wavelengths (nm), the primary one, and weights where they differ."""
     texts: dict[int, tuple[str, str, int]] = {}
     for line in file.system.get("WAVM", []):
         if len(line.arguments) < 2:
             raise InputError(f"{where}: line {line.at}: WAVM needs a number and a wavelength in µm")
-        n = count_in_text(line.arguments[0], f"{where}: line {line.at}: WAVM")
+        n = _count_in_text(line.arguments[0], f"{where}: line {line.at}: WAVM")
         texts[n] = (line.arguments[1], (*line.arguments, "1", "1")[2], line.at)
     for listed, weighted in (("WAVL", "WWGT"), ("WAVN", "WWGN")):
         given = last(file, listed)
@@ -68,7 +68,7 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
     primary = last(file, "PWAV")
     n = 1
     if primary and primary.arguments:
-        n = count_in_text(primary.arguments[0], f"{where}: line {primary.at}: PWAV")
+        n = _count_in_text(primary.arguments[0], f"{where}: line {primary.at}: PWAV")
     if n not in numbers:
         raise InputError(f"{where}: PWAV {n} is none of the wavelengths 1 to {len(numbers)}")
     reference = values[numbers.index(n)]
@@ -77,7 +77,7 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
     return found | unequal_weights("wavelength_weights", weights, len(values), place)
 
 
-def read_fields(
+def _read_fields(
     file: ZemaxFile, factor: Fraction, finite_object: bool, where: str
 ) -> dict[str, Any]:
     """Read fields, their weights where they differ, and vignetting factors where there are any.
@@ -134,16 +134,16 @@ def read_fields(
     return {"fields": fields}
 
 
-def is_axial(file: ZemaxFile, where: str) -> bool:
+def _is_axial(file: ZemaxFile, where: str) -> bool:
     """Return whether all fields are on the axis."""
-    fields = read_fields(file, Fraction(1), True, where).get("fields", {})
+    fields = _read_fields(file, Fraction(1), True, where).get("fields", {})
     points: Any = next(
         (fields[kind] for kind in (*FIELD_KINDS.values(), PUPIL_ANGLES) if kind in fields), []
     )
     return not any(value for point in points for value in point)
 
 
-def is_telecentric(file: ZemaxFile, where: str) -> bool:
+def _is_telecentric(file: ZemaxFile, where: str) -> bool:
     """Return whether the second number of FTYP asks for parallel chief rays in object space."""
     return _argument(file, 1, where) == 1
 
@@ -153,7 +153,7 @@ def last(file: ZemaxFile, operand: str) -> Line | None:
     return file.system[operand][-1] if operand in file.system else None
 
 
-def count_in_text(text: str, place: str) -> int:
+def _count_in_text(text: str, place: str) -> int:
     """Read a whole number that is not negative; `InputError` names the place."""
     value = number_in_text(text, place)
     if value != int(value) or value < 0:
@@ -166,7 +166,7 @@ def _argument(file: ZemaxFile, at: int, where: str) -> int:
     line = last(file, "FTYP")
     if line is None or len(line.arguments) <= at:
         return 0
-    return count_in_text(line.arguments[at], f"{where}: line {line.at}: FTYP")
+    return _count_in_text(line.arguments[at], f"{where}: line {line.at}: FTYP")
 
 
 def _listed(file: ZemaxFile, operands: Sequence[str], unit: Fraction, where: str) -> list[float]:
@@ -211,14 +211,14 @@ def read_system(
     if any(notes):
         found["source"] = "\n".join(notes).strip()
     found["index_model"] = "dfc"
-    found |= read_wavelengths(file, where)
-    found |= read_fields(file, factor, finite_object, where)
+    found |= _read_wavelengths(file, where)
+    found |= _read_fields(file, factor, finite_object, where)
     found |= _pupil(file, factor, finite_object, where)
-    if is_telecentric(file, where):
+    if _is_telecentric(file, where):
         if not finite_object:
             raise InputError(f"{where}: FTYP: a telecentric object space needs a finite object")
         # On the axis the chief ray is the axis, wherever the stop is.
-        if not is_axial(file, where):
+        if not _is_axial(file, where):
             found["telecentric_object"] = True
     elif _aims_real_rays(file) and not found.keys().isdisjoint(PUPIL_KEYS):
         found["real_pupil"] = True

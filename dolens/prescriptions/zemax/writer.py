@@ -40,7 +40,7 @@ _PUPILS = {
 }
 
 
-def configurations_of(
+def _configurations_of(
     prescription: Mapping[str, Any], write: Callable[[Mapping[str, Any]], str], where: str
 ) -> list[str]:
     """Return MNUM and the lines behind it, for a prescription with states.
@@ -110,7 +110,7 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
         return _without_states(prescription, where)
     alone = {key: value for key, value in prescription.items() if key != STATES_KEY}
     text = _without_states(alone, where)
-    lines = configurations_of(prescription, partial(_written, where=where), where)
+    lines = _configurations_of(prescription, partial(_written, where=where), where)
     text += "\n".join((*lines, ""))
     found = prescription_from_zemax(text, where)
     for name, state in prescription[STATES_KEY].items():
