@@ -292,11 +292,12 @@ def _element(row: Any, dtype: torch.dtype, place: str) -> Element:
         raise InputError(f"{place}: 'surfaces' must be [first, last], not {surfaces!r}")
     if not isinstance(pivot, list | tuple) or len(pivot) != 3:
         raise InputError(f"{place}: 'pivot' must be [x, y, z] in mm, not {pivot!r}")
+    pose = _pose(row, (*TILTS, *DISPLACEMENTS), place)
     try:
         return Element(
             as_integer(surfaces[0], "'surfaces'"),
             as_integer(surfaces[1], "'surfaces'"),
-            _pose(row, (*TILTS, *DISPLACEMENTS), place),
+            pose,
             [as_number(entry, "'pivot'") for entry in pivot],
             dtype,
         )

@@ -17,9 +17,7 @@ from dolens.optics.surfaces.zernike_phase import (
     ZernikePhase,
     ZernikeStandardPhase,
 )
-from dolens.prescriptions.numbers import (
-    as_number,
-)
+from dolens.prescriptions.numbers import as_number
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND, power_of
 from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
@@ -338,10 +336,7 @@ SHAPES = {
         _binary("BINARY_1", "xy", _MONOMIALS),
         _binary("BINARY_2", "radial", (f"p{2 * n}" for n in range(1, _MOST + 1))),
         ZemaxShape(
-            "ODDASPHE",
-            ("odd_asphere",),
-            CONIC,
-            powers_of_r(_parm(*range(1, 9)), range(1, 9)),
+            "ODDASPHE", ("odd_asphere",), CONIC, powers_of_r(_parm(*range(1, 9)), range(1, 9))
         ),
         ZemaxShape("XASPHERE", (), CONIC, _EVEN, _powers(2), kind="even_asphere", scales=True),
         ZemaxShape("XOSPHERE", (), CONIC, _EVEN, _powers(1), kind="odd_asphere", scales=True),
@@ -396,10 +391,7 @@ SHAPES = {
             },
             others=("PARM 9", "PARM 10", "XDAT 1", "XDAT 2"),
             own_read=lambda shape, block: shape.by_table(block) | read_grid(block),
-            own_write=lambda shape, row, place: [
-                *shape.lines(row, place),
-                *grid_lines(row, place),
-            ],
+            own_write=lambda shape, row, place: [*shape.lines(row, place), *grid_lines(row, place)],
         ),
         JONES_MATRIX,
     )

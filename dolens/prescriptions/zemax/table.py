@@ -223,7 +223,7 @@ def _order(block: SurfaceBlock, slot: str, may_be_0: bool) -> int:
         but = "" if may_be_0 else " but 0"
         raise InputError(
             f"{block.place}: {slot}, the order of diffraction, must be a whole number{but}, not "
-            f"{order:g}"
+            f"{block.slots.get(slot, '0')}"
         )
     return int(order)
 
