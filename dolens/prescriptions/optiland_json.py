@@ -15,7 +15,7 @@ from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.numbers import as_number, as_numbers
-from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object, image_shape
 from dolens.prescriptions.plain_values import (
     difference,
     even_powers,
@@ -91,7 +91,9 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
             row["thickness"] = gap
         found[str(n)] = row
     prescription["surfaces"] = found
-    prescription["sensor"] = {"distance": gap} | _image(surfaces[-1], f"{where}: the image")
+    place = f"{where}: the image"
+    shape = _shape(mapping(surfaces[-1].get("geometry"), f"{place}: 'geometry'"), place)
+    prescription["sensor"] = {"distance": gap} | image_shape(shape, place)
     place = f"{where}: the object"
     shape = _shape(mapping(surfaces[0].get("geometry"), f"{place}: 'geometry'"), place)
     return ReadPrescription(prescription, curved_object(prescription, shape, place))
@@ -281,14 +283,6 @@ def _pupil(content: dict[str, Any], where: str) -> dict[str, Any]:
     if kind not in _PUPILS:
         raise InputError(f"{where}: an aperture of type '{kind}' is not held")
     return {_PUPILS[kind]: number(aperture, "value", where)}
-
-
-def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
-    """Return radius and conic constant of a curved image."""
-    shape = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
-    if shape["type"] not in ("plane", "sphere", "conic"):
-        raise InputError(f"{place}: an image of this shape is not held")
-    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
 
 
 def _aperture_row(content: object, place: str) -> dict[str, Any]:

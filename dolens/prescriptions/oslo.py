@@ -20,7 +20,13 @@ from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.prescriptions.codev.glass import glass_by_name_or_code
 from dolens.prescriptions.numbers import exact, nearest, number_in_text, radius_row, scaled
-from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.other_programs import (
+    ReadPrescription,
+    curved_object,
+    image_shape,
+    powers_of_r,
+    row_numbers,
+)
 from dolens.prescriptions.system_data import unequal_weights
 
 _LINE_END = re.compile(r"\r\n|\r|\n")
@@ -34,7 +40,7 @@ SURFACE = (
     *("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ"),
 )
 # Coefficients of r⁴, r⁶, ..., r²⁰.
-POWERS = {f"A{letter}": 2 * i for i, letter in enumerate("DEFGHIJKL", 2)}
+POWERS = powers_of_r((f"A{letter}" for letter in "DEFGHIJKL"), range(4, 21, 2))
 # What bends no ray, by what it is about.
 _WITHOUT_EFFECT = {
     "names and drawing": ("DES", "DRW", "LBL", "COMM"),
@@ -202,7 +208,9 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     _refuse_places(image, place)
     behind = _words(image, "TH")
     gap = gaps[-1] + (exact(behind[0], f"{place}: TH") * factor if behind else 0)
-    prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
+    prescription["sensor"] = {"distance": nearest(gap, where)} | image_shape(
+        _shape(image, factor, place), place
+    )
     solves = ["solves, whose values are written"] if any("SOLVE" in b for b in blocks) else []
     groups = [f"{group} ({', '.join(keys)})" for group, keys in file.passed_over.items()]
     return ReadPrescription(prescription, [*solves, *groups, *curved])
@@ -289,11 +297,8 @@ def _object_distance(target: Block, factor: Fraction, where: str) -> float | Non
 def _shape(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
     """Return type, radius, conic constant and coefficients."""
     size = _size(block, factor, place)
-    powers = {
-        f"a{power}": scaled(_words(block, key)[0], factor ** (1 - power), f"{place}: {key}")
-        for key, power in POWERS.items()
-        if _words(block, key)
-    }
+    words = {key: _words(block, key)[0] for key in POWERS if _words(block, key)}
+    powers = row_numbers(POWERS, words, factor, place)
     conic = number_in_text((_words(block, "CC") or ["0"])[0], f"{place}: CC")
     if powers:
         return {"type": "even_asphere", **(size or {"radius": math.inf}), "conic": conic} | powers
@@ -309,13 +314,6 @@ def _size(block: Block, factor: Fraction, place: str) -> dict[str, float]:
         return {"radius": radius} if radius else {}
     curvature = scaled((_words(block, "CV") or ["0"])[0], 1 / factor, f"{place}: CV")
     return radius_row(curvature) if curvature else {}
-
-
-def _curved(image: Block, factor: Fraction, place: str) -> dict[str, float]:
-    shape = _shape(image, factor, place)
-    if shape["type"] == "even_asphere":
-        raise InputError(f"{place}: an aspheric image is not held")
-    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
 
 
 def _medium(block: Block, place: str) -> str:

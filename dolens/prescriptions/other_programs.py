@@ -79,18 +79,21 @@ def monomials(degree: int) -> dict[str, int]:
 def row_numbers(
     table: Table,
     words: Mapping[str, str],
-    unit: Callable[[str, Number], Fraction],
+    factor: Fraction,
     place: str,
-    counts: Callable[[str], bool],
+    counts: Callable[[str], bool] = bool,
+    divided: Mapping[str, Fraction] | None = None,
 ) -> dict[str, float]:
     """Return the numbers of a surface's row that a file has in its slots, in mm.
 
     Args:
         table: of the slots.
         words: slot → number as it is written; what is missing counts as 0 where there is a rule.
-        unit: what 1 in a slot means in the row, given slot and number.
+        factor: mm in a unit of the file.
         place: name of the surface in messages.
         counts: whether a text says anything where there is no rule: no zero that nobody named.
+        divided: slot → radius, in the file's unit, of terms that are lengths, of coordinates
+            divided by that radius.
 
     Raises:
         InputError: a text is no number, or one out of range.
@@ -98,19 +101,22 @@ def row_numbers(
     found: dict[str, float] = {}
     exact: dict[str, Fraction] = {}
     for slot, number in table.items():
+        what = f"{place}: {slot}"
         word = words.get(slot, "0" if number.rule else None)
         if word is None:
             continue
-        number_in_text(word, f"{place}: {slot}")
+        number_in_text(word, what)
         if not (number.rule or counts(word)):
             continue
-        scale = unit(slot, number)
-        value = scaled(word, scale, f"{place}: {slot}")
+        unit = factor**number.power * Fraction(10) ** number.shift
+        if divided and slot in divided:
+            unit /= divided[slot] ** (1 - number.power)
+        value = scaled(word, unit, what)
         if number.key in exact:
             # A coefficient in two slots.
-            value = nearest(exact[number.key] + Fraction(word) * scale, f"{place}: {slot}")
+            value = nearest(exact[number.key] + Fraction(word) * unit, what)
         elif value:
-            exact[number.key] = Fraction(word) * scale
+            exact[number.key] = Fraction(word) * unit
         found[number.key] = value
     return found
 
@@ -442,3 +448,16 @@ def _behind(
         if i < len(gaps):
             height += gaps[i] * reduced / behind
     return height, reduced
+
+
+def image_shape(shape: Mapping[str, Any], place: str) -> dict[str, float]:
+    """Return radius and conic constant of a curved image, given its shape as that of a row.
+
+    Raises:
+        InputError: it is no plane, sphere or conic.
+    """
+    if shape["type"] not in ("plane", "sphere", "conic"):
+        raise InputError(
+            f"{place}: an image of this shape is not held (allowed: a plane, sphere or conic)"
+        )
+    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}

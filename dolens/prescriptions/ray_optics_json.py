@@ -11,7 +11,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.numbers import as_number, radius_row
-from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object, image_shape
 from dolens.prescriptions.plain_values import mapping, number, require_unset, rows
 from dolens.prescriptions.system_data import unequal_weights
 
@@ -67,14 +67,9 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
         row = _row(interface, profiles, media[n - 1], media[n], n == stop, place)
         found[str(n)] = row | ({"thickness": lengths[n]} if n < len(interfaces) - 2 else {})
     prescription["surfaces"] = found
-    prescription["sensor"] = {"distance": lengths[-1]}
-    image = _object(interfaces[-1], f"{where}: the image")
-    shape = _shape(image, profiles, f"{where}: the image")
-    if shape["type"] not in ("plane", "sphere", "conic"):
-        raise InputError(f"{where}: an image of this shape is not held")
-    prescription["sensor"] |= {
-        key: shape[key] for key in ("radius", "curvature", "conic") if key in shape
-    }
+    place = f"{where}: the image"
+    shape = _shape(_object(interfaces[-1], place), profiles, place)
+    prescription["sensor"] = {"distance": lengths[-1]} | image_shape(shape, place)
     place = f"{where}: the object"
     return ReadPrescription(prescription, curved_object(prescription, target, place))
 

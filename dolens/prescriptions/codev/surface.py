@@ -11,7 +11,7 @@ HOR, and φ = 2π·path/HWL.
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
@@ -137,8 +137,8 @@ def _special_shape(
         held = slot in special.table or (slot == "SCO C1" and not special.curved)
         if not held and number_in_text(text, f"{place}: {slot}"):
             raise InputError(f"{place}: {slot} of SPS {kind} is not held")
-    counts = _all_count if kind == "QBF" else _counts
-    found = row_numbers(special.table, texts, _units(factor), place, counts)
+    counts = bool if kind == "QBF" else _counts
+    found = row_numbers(special.table, texts, factor, place, counts)
     if kind == "QBF" and found["normalization_radius"] <= 0.0:
         raise InputError(f"{place}: SPS QBF needs its radius of normalisation (SCO C1)")
     return {"type": special.type, **(_given(size) if special.curved else {}), **found}
@@ -164,17 +164,9 @@ def number_lines(values: Mapping[str, float]) -> list[str]:
     return [f"  {slot} {value!r}" if value else f"  {slot} 0" for slot, value in values.items()]
 
 
-def _units(factor: Fraction) -> Callable[[str, Number], Fraction]:
-    return lambda slot, number: factor**number.power
-
-
 def _counts(text: str) -> bool:
     """Return whether a coefficient says anything: a writer's zero has no point."""
     return text == "0" or float(text) != 0.0
-
-
-def _all_count(text: str) -> bool:
-    return True
 
 
 def phase_row(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
@@ -201,7 +193,7 @@ def phase_row(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
         raise InputError(f"{place}: the phase needs its wavelength (HWL, nm)")
     radians = 2.0 * math.pi / (float(waves[0]) * _NM)
     texts = _coefficients(block, "HCO", f"{place}: HCO")
-    paths = row_numbers(_PHASE, texts, _units(factor), place, _all_count)
+    paths = row_numbers(_PHASE, texts, factor, place)
     phases = {key: radians * value for key, value in paths.items()}
     return {"phase": {"type": "radial", "order": int(order), **phases}}
 
@@ -352,7 +344,7 @@ def _powers(block: Block, factor: Fraction, place: str) -> dict[str, float]:
     that is used are left out.
     """
     words = {key: block.said(key)[0] for key in LETTERS if block.said(key)}
-    found = row_numbers(LETTERS, words, _units(factor), place, _all_count)
+    found = row_numbers(LETTERS, words, factor, place)
     used = max((n for n, key in enumerate(LETTERS) if _counts(words.get(key, "0.0"))), default=-1)
     kept = [number.key for number in islice(LETTERS.values(), used + 1)]
     return {key: found[key] for key in kept if key in found}

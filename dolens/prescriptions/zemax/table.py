@@ -138,12 +138,14 @@ class ZemaxShape:
             named(block.slots.get(term, "0")) for term in terms
         )  # fmt: skip
         radius = self._radius(block, slot) if self.terms and divided else Fraction(1)
-
-        def unit(slot: str, number: Number) -> Fraction:
-            scale = block.factor**number.power * Fraction(10) ** number.shift
-            return scale / radius ** (1 - number.power) if slot in terms and self.scales else scale
-
-        found = row_numbers({**self.numbers, **terms}, block.slots, unit, block.place, named)
+        found = row_numbers(
+            {**self.numbers, **terms},
+            block.slots,
+            block.factor,
+            block.place,
+            named,
+            dict.fromkeys(terms, radius) if self.scales else None,
+        )
         for one, number in self.numbers.items():
             if number.rule in (ORDER, ORDER_BUT_0):
                 found[number.key] = _order(block, one, number.rule == ORDER)
