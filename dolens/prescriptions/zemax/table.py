@@ -131,25 +131,19 @@ class ZemaxShape:
     def by_table(self, block: SurfaceBlock) -> Row:
         """Return the row of a block as base and table have it."""
         base = {"type": self.kind or self.kinds[0]} | self.base.read(block)
-        count = _number_of_terms(block, self.count, len(self.terms)) if self.terms else 0
-        terms = dict(islice(self.terms.items(), count))
-        slot = f"XDAT {self.count + 1}"
-        divided = bool(terms) if self.phase else slot in self.numbers or any(
-            named(block.slots.get(term, "0")) for term in terms
-        )  # fmt: skip
-        radius = self._radius(block, slot) if self.terms and divided else Fraction(1)
+        terms, radius = self._terms(block)
         found = row_numbers(
             {**self.numbers, **terms},
             block.slots,
             block.factor,
             block.place,
             named,
-            dict.fromkeys(terms, radius) if self.scales else None,
+            dict.fromkeys(terms, radius) if radius and self.scales else None,
         )
         for one, number in self.numbers.items():
             if number.rule in (ORDER, ORDER_BUT_0):
                 found[number.key] = _order(block, one, number.rule == ORDER)
-        if self.extrapolates is not None and divided:
+        if self.extrapolates is not None and radius:
             self._require_inside(block, found)
         if not self.phase:
             return base | found
@@ -173,14 +167,24 @@ class ZemaxShape:
         ordered = sorted(texts, key=lambda slot: (slot[:4], int(slot[5:]) if slot[0] == "X" else 0))
         return [*self.base.write(row, place), *(f"{slot} {texts[slot]}" for slot in ordered)]
 
-    def _radius(self, block: SurfaceBlock, slot: str) -> Fraction:
-        """Return the radius of normalization in the file's unit; `InputError` where it is none."""
+    def _terms(self, block: SurfaceBlock) -> tuple[Table, Fraction | None]:
+        """Return the terms that a block has, and the radius of normalization in the file's unit:
+        None where nothing is divided by it, and none need be given.
+        """
+        if not self.terms:
+            return {}, None
+        count = _number_of_terms(block, self.count, len(self.terms))
+        terms = dict(islice(self.terms.items(), count))
+        slot = f"XDAT {self.count + 1}"
+        of_sag = slot in self.numbers and not self.phase
+        some = any(named(block.slots.get(term, "0")) for term in terms)
+        if not (of_sag or some or (self.phase and terms)):
+            return terms, None
         word = block.slots.get(slot, self.fixed.get(slot, "0"))
         if not number_in_text(word, f"{block.place}: {slot}") > 0.0:
-            of_sag = slot in self.numbers and not self.phase
             what = "the normalization radius" if of_sag else "the radius of normalization"
             raise InputError(f"{block.place}: {slot}, {what}, must be positive, not {word}")
-        return Fraction(word)
+        return terms, Fraction(word)
 
     def _require_inside(self, block: SurfaceBlock, found: Mapping[str, float]) -> None:
         """Refuse polynomials that end within the aperture."""
