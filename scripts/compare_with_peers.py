@@ -35,11 +35,10 @@ from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.check_files import lens_files
-from dolens.prescriptions.files import read_lens_file
-from dolens.prescriptions.zemax import parse_zemax
-from dolens.prescriptions.zemax_system import factor_to_mm
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.files import lens_files, read_lens_file
+from dolens.prescriptions.zemax.file import parse_zemax
+from dolens.prescriptions.zemax.system import factor_to_mm
+from dolens.prescriptions.zemax.writer import zemax_of
 
 # Points of the stop, over its semi-diameter.
 PUPIL = ((0.0, 0.0), (0.0, 0.7), (0.0, -0.7), (0.7, 0.0), (-0.45, 0.5), (0.0, 0.95))

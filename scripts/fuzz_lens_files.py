@@ -28,7 +28,7 @@ from dolens.prescriptions.files import (
     load_prescription,
     published_lens_names,
 )
-from dolens.prescriptions.yaml_text import plain_values, yaml_of
+from dolens.prescriptions.plain_values import plain_values, yaml_of
 from scripts.guarded_cases import guarded, place_of
 from tests.prescriptions import codev_samples, test_json_lenses, test_oslo, zemax_samples
 from tests.prescriptions.mutations import mutated

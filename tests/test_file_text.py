@@ -14,7 +14,7 @@ from dolens.experiments.lens_search.rungs import forms_of_run
 from dolens.files import read_file
 from dolens.lens_page.offenders import _read as read_tolerances
 from dolens.optics.glass_catalog import find_glass, glass_folders
-from dolens.prescriptions.check_files import check_file
+from dolens.prescriptions.files import check_file
 
 UNREADABLE = {
     "pipe": "is a pipe, no ",

@@ -106,7 +106,7 @@ def check(
     import json
 
     from dolens.errors import readable
-    from dolens.prescriptions.check_files import as_data, check_files, lens_files, summary
+    from dolens.prescriptions.files import as_data, check_files, lens_files, summary
 
     files = lens_files(folder, suffix or ())
     found = []

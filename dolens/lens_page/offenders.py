@@ -27,9 +27,9 @@ from dolens.errors import InputError, check_keys
 from dolens.lens_page.tables import Table, number
 from dolens.optics.lens import Lens
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
-from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import read_yaml_file
-from dolens.prescriptions.poses import elements_from
+from dolens.prescriptions.numbers import require_mapping
+from dolens.prescriptions.row_data import elements_from
 from dolens.tolerancing import (
     Contributions,
     Sensitivities,

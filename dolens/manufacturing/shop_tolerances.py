@@ -7,8 +7,8 @@ from typing import Any
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import read_yaml_file
+from dolens.prescriptions.numbers import require_mapping
 from dolens.tolerancing.tolerances import Tolerances, tolerances_from
 
 AGREE = "to be agreed"

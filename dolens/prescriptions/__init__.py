@@ -1,5 +1,6 @@
 """Prescriptions describe lenses as plain data, and are read from and written to files."""
 
+from dolens.optics.surfaces.spline_fit import fit_b_spline
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.files import (
     find_lens,
@@ -9,7 +10,6 @@ from dolens.prescriptions.files import (
     published_lens_names,
     save_lens,
 )
-from dolens.prescriptions.spline_fit import fit_b_spline
 
 __all__ = [
     "find_lens",

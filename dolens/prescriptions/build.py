@@ -8,24 +8,24 @@ A prescription is a mapping::
     surfaces:
       '1': {type: sphere, radius: 63, semi_diameter: 6.35, thickness: 4, material: 1.51680/64.17}
       '2': ...                  # the last surface has no thickness
-    elements:                   # optional, see poses.py; rectangular apertures: see apertures.py
+    elements:                   # optional, see row_data.py; rectangular apertures: see apertures.py
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
-    sensor: {distance: 96.0, diameter: 1.7664}   # curved: see sensor_data.py
+    sensor: {distance: 96.0, diameter: 1.7664}   # curved: see row_data.py
 
 Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
 `material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
 nd/Vd or nd/Vd/ΔPgF, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 `material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
 are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
-that stands behind them (see breaks.py).
+that stands behind them (see row_data.py).
 A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
-lens (see deflections.py).
+lens (see row_data.py).
 `thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
-So are the numbers that its source publishes (see `dolens.prescriptions.published`), and the states
-of a lens that zooms, focuses or gets warm (see `dolens.prescriptions.states`).
+So are the numbers that its source publishes, and the states of a lens that zooms, focuses or gets
+warm (see `dolens.prescriptions.states`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -41,39 +41,50 @@ from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak
-from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
-from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
-from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
-from dolens.prescriptions.checks import (
+from dolens.prescriptions.apertures import (
+    APERTURE_KEYS,
+    aperture_rows,
+    clear_aperture,
+    set_automatic_semi_diameters,
+)
+from dolens.prescriptions.numbers import (
     as_integer,
     as_number,
     as_numbers,
     check_range,
+    curvature_from,
+    curvature_row,
+    radius_key,
     require_mapping,
 )
-from dolens.prescriptions.curvatures import curvature_from, curvature_row, radius_key
-from dolens.prescriptions.deflections import (
+from dolens.prescriptions.row_data import (
+    BREAK_KIND,
+    EXPANSION_KEY,
     PHASE_KEY,
+    break_from,
+    break_row,
+    catalogue_expansion,
+    element_rows,
+    elements_from,
+    environment_of,
+    expansion_of,
+    is_break,
     is_paraxial_lens,
+    medium_of,
     phase_from,
     phase_row,
     power_row,
+    sensor_from,
+    sensor_row,
     with_power,
 )
-from dolens.prescriptions.field_data import set_object_fields
-from dolens.prescriptions.media import (
-    EXPANSION_KEY,
-    catalogue_expansion,
-    environment_of,
-    expansion_of,
-    medium_of,
-)
-from dolens.prescriptions.poses import element_rows, elements_from
-from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
-from dolens.prescriptions.sensor_data import sensor_from, sensor_row
 from dolens.prescriptions.states import STATES_KEY, state_rows, with_states
 from dolens.prescriptions.system_data import (
+    PUBLISHED_KEY,
     SYSTEM_DATA_KEYS,
+    published_from,
+    published_rows,
+    set_object_fields,
     set_stop_semi_diameter,
     stop_row,
     system_data,
@@ -252,7 +263,7 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     if kind not in SURFACES:
         raise InputError(
             f"{place}: type '{kind}' is unknown{did_you_mean(kind, SURFACES)} "
-            f"(allowed: {', '.join((*SURFACES, KIND))})"
+            f"(allowed: {', '.join((*SURFACES, BREAK_KIND))})"
         )
     shape = SURFACES[kind]
     try:

@@ -13,11 +13,9 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import radius_of
-from dolens.prescriptions.json_values import difference, mapping, number, rows
-from dolens.prescriptions.paraxial_image import paraxial_image
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import as_number, radius_row
+from dolens.prescriptions.other_programs import D_LINE, ReadPrescription, paraxial_image
+from dolens.prescriptions.plain_values import difference, even_powers, mapping, number, rows
 
 _STOPS = ("Aperture", "Stop")
 _NOT_HELD = {
@@ -34,7 +32,6 @@ _NOT_HELD = {
 _POSITIONS = 1e-3
 # Focal lengths that are noted are rounded, and of other wavelengths.
 _FOCAL_LENGTHS = 0.05
-_D_LINE = 587.5618
 _FAR = -20000.0
 
 
@@ -122,7 +119,7 @@ def _require_focal_length(
         radius = row.get("radius", math.inf)
         curvatures.append(row.get("curvature", 1.0 / radius) + 2.0 * row.get("a2", 0.0))
         try:
-            indices.append(float(parse_material(str(row["material"]), model).index(_D_LINE)))
+            indices.append(float(parse_material(str(row["material"]), model).index(D_LINE)))
         except InputError:
             return  # the lens is refused for this medium, by name, when it is built
     gaps = [row["thickness"] for row in surfaces.values() if "thickness" in row]
@@ -151,7 +148,7 @@ def _row(surface: dict[str, Any], before: str, place: str) -> dict[str, Any]:
         row = {"type": "sphere", **_curvature(surface, place)}
         if kind == "Aspheric":
             row |= {"type": "even_asphere", "conic": number(surface, "k", place, 0.0)}
-            row |= _coefficients(surface, place)
+            row |= even_powers(surface, "ai", place, 1 if surface.get("use_ai2", True) else 2)
     else:
         what = _NOT_HELD.get(kind, f"type '{kind}'")
         raise InputError(
@@ -177,9 +174,7 @@ def _curvature(surface: dict[str, Any], place: str) -> dict[str, float]:
     if surface.get("roc") is not None:
         radius = as_number(surface["roc"], f"{place}: 'roc'")
         return {"radius": radius or math.inf}
-    curvature = number(surface, "c", place)
-    exact = radius_of(curvature)
-    return {"curvature": curvature} if exact is None else {"radius": exact}
+    return radius_row(number(surface, "c", place))
 
 
 def _pose(surface: dict[str, Any], place: str) -> dict[str, float]:
@@ -211,17 +206,6 @@ def _vector(surface: dict[str, Any], key: str, count: int, place: str) -> list[f
     if len(values) != count:
         raise InputError(f"{place}: '{key}' must be a list of {count} numbers")
     return [as_number(value, f"{place}: '{key}'") for value in values]
-
-
-def _coefficients(surface: dict[str, Any], place: str) -> dict[str, float]:
-    """Return a2 (where it is not zero), a4, ... of the list `ai`."""
-    values = rows(surface.get("ai", []), f"{place}: 'ai'")
-    numbers = [as_number(value, f"{place}: 'ai'") for value in values]
-    first = 1 if surface.get("use_ai2", True) else 2
-    found = {f"a{2 * i}": value for i, value in enumerate(numbers, first)}
-    if not found.get("a2"):
-        found.pop("a2", None)
-    return found
 
 
 def _sensor(

@@ -19,14 +19,19 @@ fields, and which surfaces are more than a bare S) stands behind a # in the seco
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.errors import InputError, check_keys
-from dolens.prescriptions.checks import as_number, require_mapping
-from dolens.prescriptions.compare import require_same
-from dolens.prescriptions.decimals import curvature_in_text, number_in_text, reciprocal
-from dolens.prescriptions.diffoptics_glasses import diffoptics_material
+from dolens.errors import InputError, check_keys, comma_hint, did_you_mean
+from dolens.prescriptions.numbers import (
+    as_number,
+    curvature_in_text,
+    number_in_text,
+    reciprocal,
+    require_mapping,
+)
+from dolens.prescriptions.other_programs import require_same
 from dolens.prescriptions.system_data import SYSTEM_DATA_KEYS
 
 _COLUMNS = "type distance roc diameter material"
@@ -37,6 +42,8 @@ _LETTERS |= {"aperture": "A", "xy_polynomial": "X"}
 _HEADER_KEYS = ("source", "index_model", "stop", *SYSTEM_DATA_KEYS)
 _MONOMIALS = ("", "y", "x", "y2", "xy", "x2", "y3", "xy2", "x2y", "x3")
 _COMMON = ("type", "radius", "curvature", "semi_diameter", "thickness", "material")
+_MEDIA = {"air": "air", "occluder": "occluder", "vacuum": "occluder"}
+_PAIR = re.compile(r"\d+(\.\d+)?/\d+(\.\d+)?")
 
 
 def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, Any]:
@@ -185,7 +192,7 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
         raise InputError(f"{place}: a row of type {letter} ends with its material")
     distance = number_in_text(words[1], f"{place}: 'distance'")
     diameter = number_in_text(words[3], f"{place}: 'diameter'")
-    return letter, (distance, diameter), diffoptics_material(words[4], place)
+    return letter, (distance, diameter), _diffoptics_material(words[4], place)
 
 
 def _shape(letter: str, words: list[str], said: Mapping[str, Any], place: str) -> dict[str, Any]:
@@ -236,7 +243,7 @@ def _line(
     name = str(material)
     written = name.upper() if name in ("air", "occluder") else name
     try:
-        held = diffoptics_material(written, place) == name
+        held = _diffoptics_material(written, place) == name
     except InputError:
         held = False
     if not held:
@@ -264,3 +271,59 @@ def _more(kind: str, row: Mapping[str, Any], place: str) -> list[str]:
     else:
         names = ["conic"] if kind == "conic" else []
     return [repr(as_number(row.get(name, 0.0), f"{place}: '{name}'")) for name in names]
+
+
+# nd/Vd as diffoptics tabulates them (its index model counts them from 589.3 nm).
+DIFFOPTICS_GLASSES = {
+    "b270": "1.52290/58.50",
+    "baf10": "1.67/47.05",
+    "bk10": "1.49780/66.954",
+    "d-k59": "1.5175/63.50",
+    "f15": "1.60570/37.831",
+    "f2": "1.620/36.37",
+    "flint": "1.6200/36.37",
+    "n-baf10": "1.67003/47.11",
+    "n-bk7": "1.51680/64.17",
+    "n-sf1": "1.71736/29.62",
+    "n-sf10": "1.72828/28.53",
+    "n-sf11": "1.78472/25.68",
+    "n-sf2": "1.64769/33.82",
+    "n-sf4": "1.75513/27.38",
+    "n-sf5": "1.67271/32.25",
+    "n-sf6": "1.80518/25.36",
+    "n-sf6ht": "1.80518/25.36",
+    "n-sf8": "1.68894/31.31",
+    "pmma": "1.491756/58.00",
+    "polycarb": "1.585470/30.00",
+    "s-nph1": "1.8078/22.76",
+    "sf1": "1.71736/29.51",
+    "sf18": "1.72150/29.245",
+    "sf2": "1.64769/33.85",
+    "sf4": "1.75520/27.58",
+    "sf5": "1.67270/32.21",
+    "sf6": "1.80518/25.43",
+    "sk1": "1.61030/56.712",
+    "sk16": "1.62040/60.306",
+    "ssk4": "1.61770/55.116",
+    "uvfs": "1.458/67.82",
+}
+
+
+def _diffoptics_material(name: str, place: str) -> str:
+    """Return a medium of the diffoptics format as a prescription writes it.
+
+    A name stands for diffoptics's own nd and Vd, not for a catalogue's dispersion.  Vacuum is the
+    medium that a prescription writes `occluder`: index 1 in every index model.
+
+    Raises:
+        InputError: one line that names the place and a near name.
+    """
+    word = name.lower()
+    known = _MEDIA | DIFFOPTICS_GLASSES
+    if word not in known and not _PAIR.fullmatch(word):
+        raise InputError(
+            f"{place}: material '{name}' is unknown{did_you_mean(word, known)} (allowed: nd/Vd, "
+            "such as 1.5168/64.17, air, occluder, vacuum, or a glass in diffoptics's own table)"
+            f"{comma_hint(name)}"
+        )
+    return known.get(word, word)

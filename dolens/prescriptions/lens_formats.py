@@ -1,4 +1,7 @@
-"""The formats of lens files: how each is recognised, read and written."""
+"""The formats of lens files: how each is recognised, read and written.
+
+A file that is no lens file is named for what it is in one line, by its first bytes.
+"""
 
 import re
 from collections.abc import Callable, Mapping
@@ -10,24 +13,57 @@ from dolens.errors import InputError
 from dolens.files import decode_text, much_at_once, without_controls
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
-from dolens.prescriptions.curved_object import curved_object
+from dolens.prescriptions.deeplens_json import read_deeplens
 from dolens.prescriptions.diffoptics_text import (
     diffoptics_text_of,
     object_radius,
     prescription_from_diffoptics,
 )
-from dolens.prescriptions.json_lenses import json_of, read_json
-from dolens.prescriptions.oslo.reader import read_oslo
-from dolens.prescriptions.read_file import ReadPrescription
-from dolens.prescriptions.unknown_content import require_text
-from dolens.prescriptions.yaml_text import read_yaml, yaml_of
-from dolens.prescriptions.zemax import encode_zemax
-from dolens.prescriptions.zemax_reader import read_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.optiland_json import read_optiland
+from dolens.prescriptions.oslo import read_oslo
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.plain_values import (
+    Watched,
+    json_content,
+    json_of,
+    passed_over,
+    read_yaml,
+    yaml_of,
+)
+from dolens.prescriptions.ray_optics_json import read_ray_optics
+from dolens.prescriptions.zemax.file import encode_zemax
+from dolens.prescriptions.zemax.reader import read_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 
 # A lens is text of some kilobytes; more is no lens.
 MOST_BYTES = 64 * 2**20
 _LOOKED_AT = 65536
+
+_JsonReader = Callable[[dict[str, Any], str], ReadPrescription]
+_UTF_32 = (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")
+_UNPACK = "unpack it, and give the lens file that it holds"
+# First bytes → what the file is, and what to do.
+_BEGINNINGS: tuple[tuple[bytes, str], ...] = (
+    (b"PK\x03\x04", f"is a .zip archive; {_UNPACK}"),
+    (b"\x1f\x8b", f"is compressed (gzip); {_UNPACK}"),
+    (b"7z\xbc\xaf", f"is a .7z archive; {_UNPACK}"),
+    (b"Rar!", f"is a .rar archive; {_UNPACK}"),
+    (b"\xfd7zXZ", f"is compressed (xz); {_UNPACK}"),
+    (b"BZh", f"is compressed (bzip2); {_UNPACK}"),
+    (b"ZoS", "is OpticStudio's binary form of a lens (.zos); save it as .zmx there"),
+    (b"%PDF", "is a PDF document, no lens file"),
+    (b"\x89PNG", "is a PNG picture, no lens file"),
+    (b"\xff\xd8\xff", "is a JPEG picture, no lens file"),
+    (b"GIF8", "is a GIF picture, no lens file"),
+    (b"\xd0\xcf\x11\xe0", "is a document of Microsoft Office, no lens file"),
+    (b"\x80\x02", "is a Python pickle, which is never read; save the lens as text"),
+)
+# OpticStudio's archives begin with their version.
+_ZAR = (b"\xea\x00\x00\x00", b"\xec\x03\x00\x00")
+# CODE V's own files begin with these bytes.
+_CODE_V = b"]\x00\x00\x00"
+_CONTROL = frozenset(range(32)) - {9, 10, 11, 12, 13, 26, 27}
+_BEGIN = 4096
 
 
 @dataclass(frozen=True)
@@ -71,6 +107,42 @@ def _read_diffoptics(text: str, where: str) -> ReadPrescription:
     radius = object_radius(text, where)
     return ReadPrescription(
         prescription, curved_object(prescription, {"radius": radius}, f"{where}: the object")
+    )
+
+
+def _is_deeplens(content: dict[str, Any]) -> bool:
+    surfaces = content.get("surfaces")
+    if not isinstance(surfaces, list) or not surfaces or not isinstance(surfaces[0], dict):
+        return False
+    return "type" in surfaces[0] and any("d_next" in s for s in surfaces if isinstance(s, dict))
+
+
+# Programs that write JSON, as the keys of their files tell.
+_JSON_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], _JsonReader], ...] = (
+    (lambda content: "surface_group" in content, read_optiland),
+    (_is_deeplens, read_deeplens),
+    (lambda content: "optical_model" in content, read_ray_optics),
+)
+
+
+def read_json(text: str, where: str) -> ReadPrescription:
+    """Read a lens in JSON: dolens's own prescription, or a file of another program.
+
+    Raises:
+        InputError: it is not valid JSON, a key is given twice, or no known program wrote it.
+    """
+    content = json_content(text, where)
+    if isinstance(content.get("surfaces"), dict):
+        return ReadPrescription(content, [])
+    for holds, read in _JSON_READERS:
+        if holds(content):
+            watched = Watched(content)
+            prescription, more = read(watched, where)
+            return ReadPrescription(prescription, [*more, *passed_over(watched)])
+    keys = ", ".join(list(content)[:5]) or "none"
+    raise InputError(
+        f"{where}: no program that is known here writes lenses with the keys {keys} (allowed: "
+        "prescriptions of dolens, and files of Optiland, DeepLens and ray-optics)"
     )
 
 
@@ -195,3 +267,53 @@ def _utf_8(data: bytes, where: str, kind: str) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: is not valid {kind} ({error})") from None
+
+
+def require_text(data: bytes, where: str) -> None:
+    """Raise `InputError` where a file's content is no text of a lens; one line says what it is.
+
+    Args:
+        data: what the file holds.
+        where: its name.
+
+    Raises:
+        InputError: the file is empty, an archive, a picture, a page of a website, or binary.
+    """
+    if not data.strip(b"\0 \t\r\n\x1a\xef\xbb\xbf\xff\xfe"):
+        raise InputError(f"{where}: is empty")
+    if data.startswith(_UTF_32):
+        raise InputError(f"{where}: is text in UTF-32; save it as UTF-8 or UTF-16")
+    for beginning, what in _BEGINNINGS:
+        if data.startswith(beginning):
+            raise InputError(f"{where}: {what}")
+    if data.startswith(_ZAR) or (where.lower().endswith(".zar") and b"\0" in data[:8]):
+        raise InputError(
+            f"{where}: is an archive of OpticStudio (.zar); unpack it there (File, Load Archive) "
+            "or with unzar of the package zmxtools, and give the .zmx file that it holds"
+        )
+    if data.startswith(_CODE_V):
+        raise InputError(
+            f"{where}: is CODE V's binary form of a lens; save it as a sequence file (.seq) in "
+            "CODE V (WRL, or File, Export)"
+        )
+    begin = data[:_BEGIN].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if begin.startswith((b"<!doctype html", b"<html")):
+        raise InputError(
+            f"{where}: is a page of a website (HTML), no lens file; it may tell why a download "
+            "failed"
+        )
+    if begin.startswith((b"<?xml", b"<svg")):
+        raise InputError(f"{where}: is XML, no lens file that is known here")
+    if _is_binary(data[:_BEGIN]):
+        raise InputError(f"{where}: is binary, no text of a lens")
+
+
+def _is_binary(data: bytes) -> bool:
+    """Return whether bytes are no text in UTF-8, UTF-16 or Latin-1."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return False
+    # UTF-16 without a mark has a zero in every other byte of plain letters.
+    for text, zeros in ((data[0::2], data[1::2]), (data[1::2], data[0::2])):
+        if zeros and zeros.count(0) > 0.9 * len(zeros) and not _CONTROL & set(text):
+            return False
+    return bool(_CONTROL & set(data))

@@ -3,6 +3,8 @@
 Positions are those of the axes of each surface in global axes; gaps are their differences.  Glass
 names the file of refractiveindex.info that its data came from, and so its maker.  The first surface
 is the object, the last one the image.
+
+Of its apertures, a `DifferenceAperture` is its part `a` without its part `b`, which blocks light.
 """
 
 import math
@@ -12,12 +14,17 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.glass_catalog import find_glass
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.curved_object import curved_object
-from dolens.prescriptions.field_data import unequal_weights
-from dolens.prescriptions.json_values import difference, mapping, number, require_unset, rows
-from dolens.prescriptions.optiland_apertures import aperture_row
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import as_number, as_numbers
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object, image_shape
+from dolens.prescriptions.plain_values import (
+    difference,
+    even_powers,
+    mapping,
+    number,
+    require_unset,
+    rows,
+)
+from dolens.prescriptions.system_data import unequal_weights
 
 _FIELDS = {
     "angle": "angles",
@@ -31,6 +38,13 @@ _NM = {"um": 1e3, "nm": 1.0, "mm": 1e6, "m": 1e9}
 _INFINITE = 1e10
 # How light goes on behind a surface: by refraction or reflection, or as an ideal lens sends it.
 _REFRACTS, _IDEAL = "RefractiveReflectiveModel", "ThinLensInteractionModel"
+_DEFINITIONS = {
+    "AngleField": "angle",
+    "ObjectHeightField": "object_height",
+    "ParaxialImageHeightField": "paraxial_image_height",
+    "RealImageHeightField": "real_image_height",
+}
+_CIRCLES = ("RadialAperture", "ConfigurableRadialAperture", "OffsetRadialAperture")
 
 
 def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
@@ -77,7 +91,9 @@ def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
             row["thickness"] = gap
         found[str(n)] = row
     prescription["surfaces"] = found
-    prescription["sensor"] = {"distance": gap} | _image(surfaces[-1], f"{where}: the image")
+    place = f"{where}: the image"
+    shape = _shape(mapping(surfaces[-1].get("geometry"), f"{place}: 'geometry'"), place)
+    prescription["sensor"] = {"distance": gap} | image_shape(shape, place)
     place = f"{where}: the object"
     shape = _shape(mapping(surfaces[0].get("geometry"), f"{place}: 'geometry'"), place)
     return ReadPrescription(prescription, curved_object(prescription, shape, place))
@@ -112,7 +128,7 @@ def _row(surface: dict[str, Any], stop: bool, before: str, place: str) -> dict[s
         row = _shape(geometry, place)
     if row == {"type": "plane"} and stop and material == before:
         row = {"type": "aperture"}
-    return row | {"material": material} | aperture_row(surface.get("aperture"), place)
+    return row | {"material": material} | _aperture_row(surface.get("aperture"), place)
 
 
 def _ideal_lens(
@@ -145,20 +161,10 @@ def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
     if kind == "StandardGeometry":
         if math.isinf(radius) and not conic:
             return {"type": "plane"}
-        return (
-            {"type": "conic", "radius": radius, "conic": conic}
-            if conic
-            else {
-                "type": "sphere",
-                "radius": radius,
-            }
-        )
+        shape = {"type": "conic" if conic else "sphere", "radius": radius}
+        return shape | ({"conic": conic} if conic else {})
     if kind == "EvenAsphere":
-        values = rows(geometry.get("coefficients", []), f"{place}: 'coefficients'")
-        numbers = [as_number(value, f"{place}: 'coefficients'") for value in values]
-        terms = {f"a{2 * i}": value for i, value in enumerate(numbers, 1)}
-        if not terms.get("a2"):
-            terms.pop("a2", None)
+        terms = even_powers(geometry, "coefficients", place)
         return {"type": "even_asphere", "radius": radius, "conic": conic, **terms}
     raise InputError(
         f"{place}: a surface of shape {kind!r} is not held "
@@ -233,8 +239,8 @@ def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
     if not values:
         return {}
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}
-    weighed = unequal_weights(weights, len(values), f"{where}: weights of the wavelengths")
-    return found | ({"wavelength_weights": weighed} if weighed else {})
+    place = f"{where}: weights of the wavelengths"
+    return found | unequal_weights("wavelength_weights", weights, len(values), place)
 
 
 def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -261,18 +267,8 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     if any(any(pair) for pair in cut):
         found["vignetting"] = [{"compression_x": x, "compression_y": y} for x, y in cut]
     weights = [number(e, "weight", where, 1.0) for e in entries]
-    weighed = unequal_weights(weights, len(points), f"{where}: weights of the fields")
-    if weighed:
-        found["weights"] = weighed
-    return {"fields": found}
-
-
-_DEFINITIONS = {
-    "AngleField": "angle",
-    "ObjectHeightField": "object_height",
-    "ParaxialImageHeightField": "paraxial_image_height",
-    "RealImageHeightField": "real_image_height",
-}
+    place = f"{where}: weights of the fields"
+    return {"fields": found | unequal_weights("weights", weights, len(points), place)}
 
 
 def _pupil(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -289,9 +285,60 @@ def _pupil(content: dict[str, Any], where: str) -> dict[str, Any]:
     return {_PUPILS[kind]: number(aperture, "value", where)}
 
 
-def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
-    """Return radius and conic constant of a curved image."""
-    shape = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
-    if shape["type"] not in ("plane", "sphere", "conic"):
-        raise InputError(f"{place}: an image of this shape is not held")
-    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
+def _aperture_row(content: object, place: str) -> dict[str, Any]:
+    """Return a surface's clear aperture as a prescription's row has it.
+
+    Raises:
+        InputError: another kind of aperture.
+    """
+    if content is None:
+        return {"semi_diameter": "auto"}
+    aperture = mapping(content, f"{place}: 'aperture'")
+    edge, holes = _outline(aperture, place)
+    row: dict[str, Any] = {"aperture": edge}
+    if list(edge) == ["semi_diameter"]:
+        row = dict(edge)
+    if holes:
+        alone = len(holes) == 1 and list(edge) == ["semi_diameter"]
+        row["obscuration"] = holes[0] if alone else holes
+    return row
+
+
+def _outline(aperture: dict[str, Any], place: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the outline that light passes, and those that block it."""
+    kind = aperture.get("type")
+    if kind == "DifferenceAperture":
+        parts = [mapping(aperture.get(key), f"{place}: aperture: '{key}'") for key in "ab"]
+        (edge, holes), (blocked, inside) = (_outline(part, place) for part in parts)
+        if inside:
+            raise InputError(f"{place}: an obscuration with a hole is not held")
+        return edge, [*holes, blocked]
+    beside = {
+        f"decenter_{axis}": number(aperture, f"offset_{axis}", place, 0.0)
+        for axis in "xy"
+        if number(aperture, f"offset_{axis}", place, 0.0)
+    }
+    if kind in _CIRCLES:
+        inner = number(aperture, "r_min", place, 0.0)
+        holes = [{"semi_diameter": inner} | beside] if inner else []
+        return {"semi_diameter": number(aperture, "r_max", place)} | beside, holes
+    if kind == "EllipticalAperture":
+        axes = {
+            f"semi_axis_{axis}": number(aperture, key, place)
+            for axis, key in zip("xy", "ab", strict=True)
+        }
+        return axes | beside, []
+    if kind == "RectangularAperture":
+        row: dict[str, Any] = {}
+        for axis in "xy":
+            low, high = (number(aperture, f"{axis}_{end}", place) for end in ("min", "max"))
+            row[f"half_width_{axis}"] = 0.5 * (high - low)
+            if low + high:
+                row[f"decenter_{axis}"] = 0.5 * (low + high)
+        return row, []
+    if kind == "PolygonAperture":
+        x, y = (as_numbers(rows(aperture.get(k), place), f"{place}: aperture: '{k}'") for k in "xy")
+        if len(x) != len(y):
+            raise InputError(f"{place}: a polygon's x and y must be as many")
+        return {"polygons": [[list(vertex) for vertex in zip(x, y, strict=True)]]}, []
+    raise InputError(f"{place}: an aperture of type {kind!r} is not held")

@@ -10,12 +10,10 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
-from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.curved_object import curved_object
-from dolens.prescriptions.decimals import radius_of
-from dolens.prescriptions.field_data import unequal_weights
-from dolens.prescriptions.json_values import mapping, number, require_unset, rows
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.numbers import as_number, radius_row
+from dolens.prescriptions.other_programs import ReadPrescription, curved_object, image_shape
+from dolens.prescriptions.plain_values import mapping, number, require_unset, rows
+from dolens.prescriptions.system_data import unequal_weights
 
 _MAKERS = ("Schott", "Ohara", "Hoya", "CDGM", "Hikari", "Sumita")
 _FIELDS = {
@@ -69,14 +67,9 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
         row = _row(interface, profiles, media[n - 1], media[n], n == stop, place)
         found[str(n)] = row | ({"thickness": lengths[n]} if n < len(interfaces) - 2 else {})
     prescription["surfaces"] = found
-    prescription["sensor"] = {"distance": lengths[-1]}
-    image = _object(interfaces[-1], f"{where}: the image")
-    shape = _shape(image, profiles, f"{where}: the image")
-    if shape["type"] not in ("plane", "sphere", "conic"):
-        raise InputError(f"{where}: an image of this shape is not held")
-    prescription["sensor"] |= {
-        key: shape[key] for key in ("radius", "curvature", "conic") if key in shape
-    }
+    place = f"{where}: the image"
+    shape = _shape(_object(interfaces[-1], place), profiles, place)
+    prescription["sensor"] = {"distance": lengths[-1]} | image_shape(shape, place)
     place = f"{where}: the object"
     return ReadPrescription(prescription, curved_object(prescription, target, place))
 
@@ -109,10 +102,10 @@ def _shape(surface: dict[str, Any], profiles: dict[str, Any], place: str) -> dic
     shape, kind = _object(profile, f"{place}: profile"), _class(profile)
     curvature = number(shape, "cv", place, 0.0)
     if kind == "Spherical":
-        return {"type": "sphere", **_curvature(curvature)} if curvature else {"type": "plane"}
+        return {"type": "sphere", **radius_row(curvature)} if curvature else {"type": "plane"}
     conic = {"conic": number(shape, "cc", place, 0.0)}
     if kind == "Conic":
-        return {"type": "conic", **_curvature(curvature), **conic}
+        return {"type": "conic", **radius_row(curvature), **conic}
     if kind == "EvenPolynomial":
         values = rows(_array(shape.get("coefs", [])), f"{place}: 'coefs'")
         numbers = [as_number(value, f"{place}: 'coefs'") for value in values]
@@ -120,16 +113,11 @@ def _shape(surface: dict[str, Any], profiles: dict[str, Any], place: str) -> dic
         terms = {f"a{2 * i}": value for i, value in enumerate(numbers[:used], 1)}
         if not terms.get("a2"):
             terms.pop("a2", None)
-        return {"type": "even_asphere", **_curvature(curvature), **conic, **terms}
+        return {"type": "even_asphere", **radius_row(curvature), **conic, **terms}
     raise InputError(
         f"{place}: a surface of shape {kind!r} is not held "
         "(allowed: Spherical, Conic, EvenPolynomial)"
     )
-
-
-def _curvature(curvature: float) -> dict[str, float]:
-    radius = radius_of(curvature)
-    return {"curvature": curvature} if radius is None else {"radius": radius}
 
 
 def _medium(content: object, place: str) -> str:
@@ -183,9 +171,8 @@ def _specification(model: dict[str, Any], finite: bool, where: str) -> dict[str,
         raise InputError(f"{where}: 'reference_wvl' {reference!r} is none of the wavelengths")
     found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": values[reference]}
     weights = [as_number(v, f"{where}: weights") for v in _array(waves.get("spectral_wts") or [])]
-    weighed = unequal_weights(weights, len(values), f"{where}: 'spectral_wts'")
-    if weighed:
-        found["wavelength_weights"] = weighed
+    place = f"{where}: 'spectral_wts'"
+    found |= unequal_weights("wavelength_weights", weights, len(values), place)
     found |= _fields(_object(spec.get("field_of_view"), f"{where}: 'field_of_view'"), where)
     found |= _pupil(_object(spec.get("pupil"), f"{where}: 'pupil'"), finite, where)
     focus = spec.get("defocus")
@@ -231,9 +218,8 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     if any(any(row.values()) for row in cut):
         found["vignetting"] = cut
     weights = [number(f, "wt", where, 1.0) for f in entries]
-    weighed = unequal_weights(weights, len(entries), f"{where}: weights of the fields")
-    if weighed:
-        found["weights"] = weighed
+    place = f"{where}: weights of the fields"
+    found |= unequal_weights("weights", weights, len(entries), place)
     return {"fields": found}
 
 

@@ -31,12 +31,14 @@ from dolens.optics.lens_states import (
     overlaid,
     state_of_difference,
 )
-from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, is_automatic
-from dolens.prescriptions.automatic_apertures import set_common_semi_diameters
-from dolens.prescriptions.checks import as_number, require_mapping
-from dolens.prescriptions.field_data import field_rows
-from dolens.prescriptions.published import PUBLISHED_KEY, published_rows
-from dolens.prescriptions.system_data import PUPIL_KEYS
+from dolens.prescriptions.apertures import (
+    APERTURE_KEYS,
+    aperture_rows,
+    is_automatic,
+    set_common_semi_diameters,
+)
+from dolens.prescriptions.numbers import as_number, require_mapping
+from dolens.prescriptions.system_data import PUBLISHED_KEY, PUPIL_KEYS, field_rows, published_rows
 
 STATES_KEY = "states"
 MOST_STATES = 100

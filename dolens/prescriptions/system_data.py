@@ -30,25 +30,35 @@ at the reference wavelength, and stays what the prescription says where that is 
 `real_pupil: true` its rim is where the real marginal ray to the rim of that image crosses it.
 A lens has fields by angles or by heights on the object: those that a prescription gives by the
 image or the pupil are converted when the lens is built (`dolens.optics.field_and_aperture`).
+
+The numbers that the lens's source publishes are in mm and degrees, each of them optional::
+
+    published: {kind: Tessar, efl: 100, efl_tolerance: 0.5, f_number: 3.5, half_field: 25.7}
+
+(see `dolens.optics.lens.Published`).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.dispersion import require_wavelengths
-from dolens.optics.field_and_aperture import in_double_precision, real_marginal_height
-from dolens.optics.fields import require_from_the_front
-from dolens.optics.lens import Lens
+from dolens.optics.field_and_aperture import (
+    heights_of_pupil_angles,
+    in_double_precision,
+    object_fields,
+    real_marginal_height,
+)
+from dolens.optics.fields import Fields, Vignetting, require_from_the_front
+from dolens.optics.lens import Lens, Published
 from dolens.optics.paraxial import matrix_to_stop, vergence
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.prescriptions.apertures import is_automatic
-from dolens.prescriptions.checks import as_number, as_positive
-from dolens.prescriptions.field_data import field_rows, fields_from, weights_from
+from dolens.prescriptions.numbers import as_number, as_positive, require_mapping
 
 PUPIL_KEYS = ("entrance_pupil_diameter", "f_number", "working_f_number", "object_na")
 SYSTEM_DATA_KEYS = (
@@ -69,13 +79,21 @@ _TELECENTRIC = 1e4
 _ROUNDED = 1e-4
 # Stands for a stop's semi-diameter (mm) until the pupil decides: within any surface's sag branch.
 _UNDECIDED = 1e-6
+_FIELD_KINDS = ("angles", "heights", "pupil_angles", "image_heights", "real_image_heights")
+_ANGLES = ("angles", "pupil_angles")
+# Kinds of field points on the image, and whether real rays decide.
+_BY_THE_IMAGE = {"image_heights": False, "real_image_heights": True}
+PUBLISHED_KEY = "published"
+_WORDS = ("kind", "note")
+# All others are positive.
+_SIGNED = ("magnification", "bfd")
 
 
 def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return the system data as arguments of `Lens`: all but the pupil.
 
     Fields by the image or the pupil are as the prescription has them; `set_object_fields` of
-    `dolens.prescriptions.field_data` converts them.
+    `dolens.prescriptions.system_data` converts them.
 
     Raises:
         InputError: one line that names `where` and the key; two pupils are one too many.
@@ -99,7 +117,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
             )
     weights = prescription.get("wavelength_weights")
     if weights is not None:
-        weights = weights_from(weights, len(wavelengths or ()), f"{where}: 'wavelength_weights'")
+        weights = _weights_from(weights, len(wavelengths or ()), f"{where}: 'wavelength_weights'")
     air = {}
     for key in ("temperature", "pressure"):
         value = prescription.get(key)
@@ -113,7 +131,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     distance = prescription.get("object_distance")
     if distance is not None:
         distance = as_positive(distance, f"{where}: 'object_distance'")
-    fields = fields_from(prescription.get("fields"), f"{where}: fields")
+    fields = _fields_from(prescription.get("fields"), f"{where}: fields")
     if fields is not None and fields.kind == "heights" and distance is None:
         raise InputError(f"{where}: 'fields.heights' need an 'object_distance' (mm)")
     if fields is not None and fields.kind == "angles" and vergence(distance) != 0.0:
@@ -249,3 +267,153 @@ def _pupil(prescription: Mapping[str, Any]) -> str | None:
 
 def _stop_of(prescription: Mapping[str, Any], stop: int) -> Mapping[str, Any]:
     return {str(n): row for n, row in prescription["surfaces"].items()}[str(stop)]
+
+
+def _fields_from(value: Any, place: str) -> Fields | None:
+    """Read the fields of a prescription, of any kind; None where it has none.
+
+    Raises:
+        InputError: one line that names the key.
+    """
+    if value is None:
+        return None
+    require_mapping(value, place)
+    check_keys(value, (*_FIELD_KINDS, "weights", "vignetting"), place)
+    kinds = [kind for kind in _FIELD_KINDS if value.get(kind) is not None]
+    if len(kinds) != 1:
+        raise InputError(
+            f"{place}: give one of 'angles', 'pupil_angles' (degrees), 'heights', 'image_heights' "
+            "and 'real_image_heights' (mm)"
+        )
+    kind, points = kinds[0], value[kinds[0]]
+    shape = f"{place}: '{kind}' must be a list of points [x, y]"
+    if not isinstance(points, list | tuple) or not points:
+        raise InputError(f"{shape}, not {points!r}")
+    found = []
+    for point in points:
+        if not isinstance(point, list | tuple) or len(point) != 2:
+            raise InputError(f"{shape}, not {point!r}")
+        x, y = (as_number(entry, f"{place}: '{kind}'") for entry in point)
+        # Beyond 90° in x and y at once there is no convention of which direction is meant.
+        limit = 180.0 if kind == "angles" and 0.0 in (x, y) else 90.0
+        if kind in _ANGLES and max(abs(x), abs(y)) >= limit:
+            along = "" if kind == "pupil_angles" else " (180 along x or y alone)"
+            raise InputError(f"{place}: '{kind}' must be below 90 degrees{along}, not {point!r}")
+        found.append((x, y))
+    weights, vignetting = value.get("weights"), value.get("vignetting")
+    if weights is not None:
+        weights = tuple(_weights_from(weights, len(found), f"{place}: 'weights'"))
+    if vignetting is not None:
+        if not isinstance(vignetting, list | tuple) or len(vignetting) != len(found):
+            raise InputError(f"{place}: 'vignetting' must be a list of {len(found)}, one a field")
+        vignetting = tuple(_vignetting(one, f"{place}: 'vignetting'") for one in vignetting)
+    return Fields(kind, tuple(found), weights, vignetting)
+
+
+def _vignetting(value: Any, place: str) -> Vignetting:
+    require_mapping(value, place)
+    check_keys(value, Vignetting._fields, place)
+    found = Vignetting(
+        **{key: as_number(entry, f"{place}: '{key}'") for key, entry in value.items()}
+    )
+    if max(found.compression_x, found.compression_y) >= 1.0:
+        raise InputError(f"{place}: compressions must be below 1, which leaves no light")
+    return found
+
+
+def _weights_from(value: Any, count: int, place: str) -> list[float]:
+    """Read as many weights: numbers that are not negative, of any positive sum."""
+    if not isinstance(value, list | tuple) or len(value) != count:
+        raise InputError(f"{place} must be a list of {count} numbers")
+    found = [as_number(entry, place) for entry in value]
+    if min(found) < 0.0 or not any(found):
+        raise InputError(f"{place} must not be negative, and not all zero")
+    return found
+
+
+def unequal_weights(
+    key: str, values: Sequence[float], count: int, place: str
+) -> dict[str, list[float]]:
+    """Return the weights, under a key, that a file gives its first `count` wavelengths or fields;
+    nothing where it gives none, or all are the same.
+
+    Raises:
+        InputError: too few, a negative one, or zeros alone; the message begins with the place.
+    """
+    if not values:
+        return {}
+    if len(values) < count:
+        raise InputError(f"{place} gives {len(values)} weights for {count}")
+    found = _weights_from(list(values[:count]), count, place)
+    return {key: found} if len(set(found)) > 1 else {}
+
+
+def field_rows(fields: Fields) -> dict[str, Any]:
+    """Return the mapping that `_fields_from` reads back."""
+    rows: dict[str, Any] = {fields.kind: [list(point) for point in fields.points]}
+    if fields.weights is not None:
+        rows["weights"] = list(fields.weights)
+    if fields.vignetting is not None:
+        rows["vignetting"] = [
+            {key: value for key, value in one._asdict().items() if value}
+            for one in fields.vignetting
+        ]
+    return rows
+
+
+def set_object_fields(lens: Lens) -> Lens:
+    """Give a new lens the fields of the object that belong to those of its prescription.
+
+    Raises:
+        InputError: the lens forms no image, or no chief ray lands there, or the entrance pupil is
+            at infinity.
+    """
+    fields = lens.fields
+    if fields is None or fields.kind in ("angles", "heights"):
+        return lens
+    kind = "angles" if vergence(lens.object_distance) == 0.0 else "heights"
+    points = torch.tensor(fields.points, dtype=torch.float64)
+    if fields.kind in _BY_THE_IMAGE:
+        points = object_fields(lens, points, _BY_THE_IMAGE[fields.kind])
+    elif kind == "heights":
+        points = heights_of_pupil_angles(lens, points)
+    lens.fields = fields._replace(kind=kind, points=tuple((x, y) for x, y in points.tolist()))
+    return lens
+
+
+def published_from(value: Any, where: str) -> Published | None:
+    """Read what a prescription says under `published`; None where it says nothing.
+
+    Args:
+        value: a mapping, or None.
+        where: name of the prescription, for messages.
+
+    Raises:
+        InputError: one line that names the key.
+    """
+    if value is None:
+        return None
+    place = f"{where}: {PUBLISHED_KEY}"
+    require_mapping(value, place)
+    check_keys(value, Published._fields, place)
+    found: dict[str, Any] = {}
+    for key, entry in value.items():
+        what = f"{place}: '{key}'"
+        if entry is None:
+            continue
+        if key in _WORDS:
+            if not isinstance(entry, str):
+                raise InputError(f"{what} must be text, not {entry!r}")
+            found[key] = entry
+        else:
+            found[key] = as_number(entry, what) if key in _SIGNED else as_positive(entry, what)
+    return Published(**found)
+
+
+def published_rows(published: Published | None) -> dict[str, Any]:
+    """Return the keys of a prescription that `published_from` reads back; none of a lens without
+    published numbers.
+    """
+    if published is None:
+        return {}
+    return {PUBLISHED_KEY: {k: v for k, v in published._asdict().items() if v is not None}}

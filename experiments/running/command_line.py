@@ -21,7 +21,7 @@ from dolens.experiments.running.catalogue import added_folders, configuration_fo
 from dolens.files import packaged_configuration, user_cache_folder, write_whole
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.files import SUFFIXES, read_lens_file
-from dolens.prescriptions.yaml_text import yaml_of
+from dolens.prescriptions.plain_values import yaml_of
 
 # A value that begins so is a list, a mapping, a function or quoted: it needs no quotes around it.
 _STRUCTURED = ("[", "{", "'", '"')

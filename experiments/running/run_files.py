@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from dolens.errors import InputError, one_line
 from dolens.files import written_whole
-from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.plain_values import plain_values
 
 INFO, METRICS = "run.json", "metrics.json"
 CONFIG, RESOLVED = ".hydra/config.yaml", ".hydra/resolved.yaml"

@@ -32,7 +32,7 @@ from dolens.experiments.running.run_files import (
     metrics_of,
     read_yaml,
 )
-from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.plain_values import plain_values
 
 logger = logging.getLogger(__name__)
 

@@ -9,9 +9,9 @@ import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.lens_search.form_coordinates import FormArrays
 from dolens.lens_search.forms import (
     TOLERANCE,
-    FormArrays,
     FoundLens,
     distinct,
     form_coordinates,

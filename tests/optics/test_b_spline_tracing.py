@@ -165,7 +165,7 @@ def test_a_roof_at_a_triple_knot_is_met_like_its_two_planes(sense):
 
 def test_a_spline_close_to_a_conic_bends_rays_like_it():
     """Not a polynomial: the spline's error falls as h⁴, and so does the ray's (slopes as h³)."""
-    from dolens.prescriptions.spline_fit import fit_b_spline
+    from dolens.optics.surfaces.spline_fit import fit_b_spline
 
     conic, grid = Conic(4.0, {"curvature": 0.05, "conic": -0.6}), np.linspace(-5, 5, 201)
     x = torch.tensor(grid)

@@ -9,8 +9,8 @@ from scipy.interpolate import RectBivariateSpline
 from dolens import InputError, Rays, Status
 from dolens.optics.surfaces import EvenAsphere, GridSag
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 
 F64 = torch.float64
 BASE = {"curvature": 0.02, "conic": -0.5, "a4": 1e-6}

@@ -8,7 +8,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.other_programs import ReadPrescription
 from tests.prescriptions.computed import Computed
 
 # A longer distance is infinite.

@@ -22,12 +22,11 @@ from dolens.prescriptions.build import (
     lens_from_prescription,
     prescription_of,
 )
-from dolens.prescriptions.field_data import _FIELD_KINDS
-from dolens.prescriptions.json_lenses import read_json
-from dolens.prescriptions.lens_formats import read_lens
-from dolens.prescriptions.read_file import ReadPrescription
-from dolens.prescriptions.sensor_data import SENSOR_KEYS
-from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.lens_formats import read_json, read_lens
+from dolens.prescriptions.other_programs import ReadPrescription
+from dolens.prescriptions.plain_values import plain_values
+from dolens.prescriptions.row_data import SENSOR_KEYS
+from dolens.prescriptions.system_data import _FIELD_KINDS
 from tests.prescriptions.judged_keys import (
     changed_data,
     changed_text,

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from dolens.errors import InputError
-from dolens.prescriptions.json_lenses import read_json
-from dolens.prescriptions.lens_formats import read_lens
+from dolens.prescriptions.lens_formats import read_json, read_lens
 from tests.prescriptions.codev_samples import SINGLET, system
 from tests.prescriptions.zemax_samples import singlet
 

@@ -6,10 +6,10 @@ from dolens import InputError, load_lens
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
-from dolens.prescriptions.compare import differences
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of
-from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.other_programs import differences
+from dolens.prescriptions.zemax.reader import prescription_from_zemax, read_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.samples import SINGLET
 
 FILM = SINGLET | {"sensor": {"distance": 30.0, "diameter": 10.0, "radius": -27.3, "conic": -0.4}}

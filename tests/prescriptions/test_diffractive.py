@@ -7,8 +7,8 @@ import torch
 
 from dolens import InputError, Rays
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 
 RADIAL = {"type": "radial", "order": 1, "norm_radius": 10.0, "p2": -1133.351455930, "p4": 341.9}
 XY = {"type": "xy", "order": -2, "norm_radius": 5.0, "x": 12.5, "x2y": -3.0, "y4": 0.0}

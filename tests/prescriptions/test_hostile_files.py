@@ -9,7 +9,7 @@ from dolens import InputError, load_lens
 from dolens.errors import check_keys
 from dolens.optics.glass_catalog import glass_folders
 from dolens.prescriptions.files import find_lens
-from dolens.prescriptions.yaml_text import plain_values
+from dolens.prescriptions.plain_values import plain_values
 from scripts.fuzz_lens_files import outcome
 from tests.prescriptions.codev_samples import TRIPLET as CODE_V
 from tests.prescriptions.mutations import mutated

@@ -11,7 +11,8 @@ import torch
 from dolens import load_lens, save_lens
 from dolens.optics.rays import Rays
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.json_lenses import json_of, read_json
+from dolens.prescriptions.lens_formats import read_json
+from dolens.prescriptions.plain_values import json_of
 from tests.prescriptions.samples import SINGLET, require_refused
 
 PEERS = Path(__file__).parent / "peer_files"

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dolens import load_lens
-from dolens.prescriptions.oslo.reader import read_oslo
+from dolens.prescriptions.oslo import read_oslo
 from tests.prescriptions.codev_samples import TRIPLET as CODE_V_TRIPLET
 from tests.prescriptions.samples import require_refused
 

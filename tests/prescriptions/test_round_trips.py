@@ -16,10 +16,11 @@ from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
-from dolens.prescriptions.json_lenses import json_of, read_json
-from dolens.prescriptions.zemax import encode_zemax
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.lens_formats import read_json
+from dolens.prescriptions.plain_values import json_of
+from dolens.prescriptions.zemax.file import encode_zemax
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.samples import SINGLET
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))

@@ -100,7 +100,7 @@ def test_much_smoothing_leaves_the_plane_of_best_fit():
 
 def test_the_energy_is_the_integral():
     """One coefficient against s = x²·y: mean of s_xx² + 2·s_xy² + s_yy² = mean of 4y² + 8x²."""
-    from dolens.prescriptions.spline_fit import _bending
+    from dolens.optics.surfaces.spline_fit import _bending
 
     knots_x, knots_y = clamped_knots(3.0, 6), clamped_knots(2.0, 5)
     t, u = np.array(knots_x), np.array(knots_y)

@@ -7,7 +7,8 @@ import torch
 
 from dolens import InputError, load_lens, save_lens
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_reader import read_zemax
+from dolens.prescriptions.zemax.reader import read_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.samples import SINGLET
 from tests.prescriptions.zemax_samples import triplet
 
@@ -167,6 +168,14 @@ def test_what_no_configuration_holds_is_refused(state, said, tmp_path):
     lens = lens_from_prescription(with_states(a=state))
     with pytest.raises(InputError, match=said):
         save_lens(lens, tmp_path / "lens.zmx")
+
+
+@pytest.mark.parametrize("pupil", [{"entrance_pupil_diameter": 4.0}, {"f_number": None}])
+def test_a_configuration_has_the_pupil_of_the_others(pupil):
+    """Of its own it may have another number, and no other kind of aperture."""
+    lens = SINGLET | {"f_number": 5.0, "states": {"a": pupil}}
+    with pytest.raises(InputError, match="state 'a': no configuration"):
+        zemax_of(lens)
 
 
 def test_configurations_of_a_file_are_its_states():

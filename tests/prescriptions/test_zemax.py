@@ -7,7 +7,7 @@ import torch
 
 from dolens import Rays, Status, load_lens
 from dolens.optics.fields import Fields
-from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
+from dolens.prescriptions.zemax.reader import prescription_from_zemax, read_zemax
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet, surface, triplet
 
 

@@ -3,8 +3,8 @@
 import pytest
 
 from dolens import InputError
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import GLASS, singlet
 
 APERTURES = {

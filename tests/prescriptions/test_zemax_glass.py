@@ -12,9 +12,9 @@ from dolens.optics.glass import Environment
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_glass import read_glass
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.glass import read_glass
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import singlet
 
 NOTHING = "0 0 1.5 40 0 0 0 0 0 0"  # what Zemax writes beside a name

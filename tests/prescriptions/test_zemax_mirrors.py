@@ -6,8 +6,8 @@ import torch
 from dolens import Rays
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.kernels.trace_cases import LENSES
 
 F64 = torch.float64

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from dolens import InputError, Rays
-from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax, read_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import lens_of, singlet, surface
 
 INDEX, RADIUS, THICK = 1.5, 20.0, 5.0

@@ -1,14 +1,18 @@
 """Surfaces given by their sag in Zemax files: read as meant, written, and read again."""
 
 import math
+import re
 
 import pytest
 import torch
 
 from dolens import InputError, Rays
+from dolens.optics.surfaces.xy_polynomial import monomial_powers
 from dolens.prescriptions import lens_from_prescription
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.codev.surface import LETTERS, SPECIALS
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.shapes import SHAPES
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import singlet
 
 GLASS = "GLAS ___BLANK 1 0 1.5 6.0E+1 0 0 0 0 0 0"
@@ -161,3 +165,21 @@ def test_type_0_of_a_forbes_surface_is_q_bfs_about_its_conic():
     hit = lens.trace(Rays(start, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)))
     assert hit.valid.all()
     assert hit.position[:, 0].abs().max() < 3e-3
+
+
+TABLES = {
+    **{f"TYPE {t}": (0 if s.phase else 1, {**s.numbers, **s.terms}) for t, s in SHAPES.items()},
+    **{f"SPS {kind}": (1, special.table) for kind, special in SPECIALS.items()},
+    "ASP": (1, LETTERS),
+}
+
+
+@pytest.mark.parametrize(("dimension", "table"), TABLES.values(), ids=TABLES)
+def test_a_coefficient_times_its_powers_of_length_is_a_length(dimension, table):
+    """Of a phase it is a number, as its coordinates are divided by a length."""
+    for slot, number in table.items():
+        power = re.fullmatch(r"a(\d+)", number.key)
+        monomial = monomial_powers(number.key)
+        if power or monomial or re.fullmatch(r"[pqz]\d+", number.key):
+            degree = int(power[1]) if power else sum(monomial or (0,))
+            assert number.power + (degree if dimension else 0) == dimension, slot

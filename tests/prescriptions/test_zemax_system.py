@@ -7,8 +7,8 @@ import torch
 
 from dolens import Rays
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.writer import zemax_of
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
 
 GOOD = ("CURV 0.02", "DISZ 4", GLASS)

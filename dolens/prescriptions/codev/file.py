@@ -1,16 +1,183 @@
-"""The commands of a CODE V `.seq` file are sorted by system and surface."""
+"""The text of a CODE V `.seq` file is split into commands, which are sorted by system and surface.
+
+A command is a word and its arguments.  A semicolon or a line end ends it, `&` at the end of a line
+continues it, `!` begins a remark, and text stands in quotes of either kind.  Only the first three
+letters of a longer command count, in any case.  Tables say which commands are read, which bend no
+ray, and which are refused.
+"""
 
 import re
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.codev.keys import GROUP_OF, MACRO, REFUSED, SURFACE, SYSTEM
-from dolens.prescriptions.codev.text import Command, commands_of
 
+# Aperture, fields, wavelengths and surroundings of the system.
+SYSTEM = (
+    *("TIT", "DIM", "EPD", "FNO", "NA", "NAO", "WL", "REF", "WTW", "TEM", "PRE", "PUI"),
+    *("XAN", "YAN", "XOB", "YOB", "XIM", "YIM", "XRI", "YRI", "WTF", "VUX", "VLX", "VUY", "VLY"),
+    "TEL",
+)
+# Of one surface: the one whose lines they follow, or the one that `S4` names.
+SURFACE = (
+    *("RDY", "CUY", "THI", "GLA", "RMD", "STO", "SLB", "SPH", "CON", "ASP", "K", "PIM"),
+    *("A", "B", "C", "D", "E", "F", "G", "H", "J", "CUF", "SPS", "SCO"),
+    *("DIF", "HOR", "HWL", "HCT", "HCO"),
+    *("CIR", "REX", "REY", "ELX", "ELY", "ADX", "ADY", "ARO"),
+    *("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "XOD", "YOD", "ZOD", "DAR", "BEN", "REV"),
+)
+# What bends no ray, by what it is about; the results of solves and pick-ups are written anyway.
+_WITHOUT_EFFECT = {
+    "variables, couplings and limits of an optimization": (
+        *("CCY", "CCX", "THC", "GLC", "KC", "AC", "BC", "CC", "DC", "EC", "FC", "GC", "HC", "JC"),
+        *("CCF", "XDC", "YDC", "ZDC", "ADC", "BDC", "CDC", "HCC", "SCC", "CUM", "THM", "PIK"),
+    ),
+    "tolerances": (
+        *("TDY", "TDX", "TDR", "TDZ", "TTA", "TTB", "TTC", "TIR", "DLF", "DLT", "DLN", "DLV"),
+        *("DLZ", "DLA", "DLB", "DLC", "DLX", "DLY", "DLK", "DLR", "DLS", "BTI", "BTX", "BTY"),
+        *("TRX", "TRY", "CYD", "CYN", "CYT", "TOL", "COM"),
+    ),
+    "polarization": ("POL",),
+    "settings of the program": ("CA", "CWL", "CLS", "DER", "DOR", "IC", "IFO", "ACO"),
+    "": ("INI", "UID", "VIE", "WID"),
+}
+GROUP_OF = {key: group for group, keys in _WITHOUT_EFFECT.items() for key in keys}
+# What bends rays and is not held: three letters → the name that optics gives it.
+REFUSED = {
+    "CYL": "a cylinder",
+    "XTO": "a toroid",
+    "YTO": "a toroid",
+    "AAS": "an anamorphic asphere",
+    "CUX": "a second radius, across x",
+    "RDX": "a second radius, across x",
+    "SPL": "a spline surface",
+    "UDS": "a surface of the user's own program",
+    "ZRN": "a Zernike surface",
+    "HOE": "a hologram",
+    "GRT": "a diffraction grating",
+    "GRO": "a diffraction order",
+    "GRS": "the spacing of a diffraction grating",
+    "GRX": "the direction of a diffraction grating",
+    "GRY": "the direction of a diffraction grating",
+    "FRN": "a Fresnel lens",
+    "LMO": "a lens module",
+    "MFL": "the focal length of a lens module",
+    "NSS": "a group of non-sequential surfaces",
+    "ARR": "an array of surfaces",
+    "INT": "an interferogram file on a surface",
+    "INS": "a lens inserted from another file",
+    "GRN": "a gradient index",
+    "GLB": "axes relative to another surface (GLB)",
+    "RET": "a return to the axes of another surface (RET)",
+    "CIG": "an aperture with its own place",
+    "REG": "an aperture with its own place",
+    "ELG": "an aperture with its own place",
+    "POY": "a polygon as aperture",
+    "BIR": "a birefringent medium",
+    "APD": "apodization of the pupil",
+    "PUX": "the width of a Gaussian beam",
+    "PUY": "the width of a Gaussian beam",
+    "DST": "a surface with a distribution",
+}
+# Programs in CODE V's own language begin with these, or with a variable (^x).
+MACRO = ("NUM", "STR", "FOR", "IF", "WHI", "EVA", "WRI", "BUF", "LCL", "GBL", "FCT", "RFD", "IN")
+
+
+# CODE V itself reads far shorter lines; a longer one is no lens.
+_LONGEST_LINE = 100_000
+_LINE_END = re.compile(r"\r\n|\r|\n")
+# A quoted text (an open quote ends with its line), or a word, which may hold one (L'A').
+_WORD = re.compile(
+    r"""(?P<remark>!.*)|(?P<end>;)|(?P<word>(?:'[^']*(?:'|$)|"[^"]*(?:"|$)|[^\s;!'"])+)"""
+)
+_SURFACE = re.compile(r"S(O|I|[0-9]+)?")
 _NUMBERED = re.compile(r"S(O|I|S|[0-9]+)")
 _MOST_SURFACES = 2000
 # Variables and functions of macros begin with these.
 _VARIABLES = ("^", "@", "(")
+
+
+class Command(NamedTuple):
+    """A `Command` has the number of its line from 1, its key and its arguments.
+
+    Attributes:
+        at: number of the line that it begins in.
+        key: its word in capitals, cut to three letters; `S`, `SO`, `SI` or `S4` for a surface.
+        words: arguments as they are written, with their quotes.
+    """
+
+    at: int
+    key: str
+    words: list[str]
+
+
+def commands_of(text: str, where: str) -> list[Command]:
+    """Split the text of a `.seq` file into commands.
+
+    Raises:
+        InputError: a line, with what continues it, is longer than 100 000 letters.
+    """
+    found: list[Command] = []
+    held: list[str] = []
+    length, begins = 0, 0
+    for at, line in enumerate(_LINE_END.split(text), 1):
+        if length + len(line) > _LONGEST_LINE:
+            raise InputError(f"{where}: line {at} is longer than {_LONGEST_LINE} letters")
+        code = _without_remark(line)
+        begins = begins if held else at
+        length += len(code)
+        if code.endswith("&"):
+            held.append(code[:-1] + " ")
+            continue
+        if held or code:
+            found += _commands("".join((*held, code)), begins)
+        held, length = [], 0
+    return found + _commands("".join(held), begins)
+
+
+def opening_remarks(text: str) -> str:
+    """Return the remarks in front of the first command, a line each."""
+    found = []
+    for line in _LINE_END.split(text):
+        if line.strip() and not line.startswith("!"):
+            break
+        found.append(line[1:].strip())
+    return "\n".join(found).strip()
+
+
+def unquoted(word: str) -> str:
+    """Return a word without the quotes around it."""
+    if word[:1] in ("'", '"'):
+        return word[1:].removesuffix(word[0])
+    return word
+
+
+def _without_remark(line: str) -> str:
+    if "!" not in line:
+        return line.rstrip()
+    for match in _WORD.finditer(line):
+        if match["remark"] is not None:
+            return line[: match.start()].rstrip()
+    return line.rstrip()
+
+
+def _commands(line: str, at: int) -> list[Command]:
+    found: list[Command] = []
+    words: list[str] = []
+    for match in _WORD.finditer(line):
+        if match["word"] is not None:
+            words.append(match["word"])
+        if match["end"] is not None and words:
+            found.append(_command(at, words))
+            words = []
+    return [*found, _command(at, words)] if words else found
+
+
+def _command(at: int, words: list[str]) -> Command:
+    key = words[0].upper()
+    if _SURFACE.fullmatch(key) is None and key[:1] not in ("'", '"'):
+        key = key[:3]
+    return Command(at, key, words[1:])
 
 
 @dataclass
@@ -31,6 +198,10 @@ class Block:
     radii: bool | None
     words: list[str]
     commands: dict[str, list[Command]] = field(default_factory=dict)
+
+    def said(self, key: str) -> list[str]:
+        """Return the arguments of the last command of a key; none where there is none."""
+        return self.commands[key][-1].words if key in self.commands else []
 
 
 @dataclass

@@ -12,9 +12,8 @@ from itertools import combinations, pairwise
 from dolens.errors import InputError, comma_hint
 from dolens.optics.glass_catalog import find_glass, likely_makers, makers_of
 from dolens.optics.materials import abbe_number, index_model, parse_material
-from dolens.prescriptions.codev.file import CodeVFile
-from dolens.prescriptions.codev.text import unquoted
-from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.codev.file import CodeVFile, unquoted
+from dolens.prescriptions.numbers import number_in_text
 
 _SIX_DIGITS = re.compile(r"(\d{3})(\d{3})")
 _CODE = re.compile(r"(\d{1,8})\.(\d{1,8})")

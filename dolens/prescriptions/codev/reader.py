@@ -18,11 +18,14 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.materials import index_model, parse_material
-from dolens.prescriptions.codev.apertures import has_apertures, read_apertures
-from dolens.prescriptions.codev.axes import Axes, summed
-from dolens.prescriptions.codev.file import Block, parse_codev
+from dolens.prescriptions.codev.file import Block, opening_remarks, parse_codev
 from dolens.prescriptions.codev.glass import read_glass
-from dolens.prescriptions.codev.passed_over import passed_over, require_first_position
+from dolens.prescriptions.codev.placement import (
+    Axes,
+    has_apertures,
+    read_apertures,
+    summed,
+)
 from dolens.prescriptions.codev.surface import (
     Surface,
     conic_constant,
@@ -31,17 +34,23 @@ from dolens.prescriptions.codev.surface import (
     read_surface,
     shape_is_given,
 )
-from dolens.prescriptions.codev.system import factor_to_mm, read_system
-from dolens.prescriptions.codev.text import opening_remarks
-from dolens.prescriptions.curved_object import curved_object
-from dolens.prescriptions.decimals import exact, nearest, number_in_text
-from dolens.prescriptions.paraxial_image import paraxial_image
-from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.codev.system import (
+    factor_to_mm,
+    passed_over,
+    read_system,
+    require_first_position,
+)
+from dolens.prescriptions.numbers import exact, nearest, number_in_text
+from dolens.prescriptions.other_programs import (
+    D_LINE,
+    ReadPrescription,
+    curved_object,
+    paraxial_image,
+)
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 # CODE V writes 1e13, and takes any distance from here on for infinity.
 _INFINITE = 1e10
-_D_LINE = 587.5618
 # A gap of PIM within this part of the focal length is CODE V's own, found with its own glass data.
 _OWN_SOLVE = 1e-3
 
@@ -74,7 +83,7 @@ def read_codev(text: str, where: str = "lens") -> ReadPrescription:
     found = read_system(file, factor, distance is not None, where)
     remarks = opening_remarks(text)
     found |= {"source": remarks} if remarks else {}
-    waves = found.get("wavelengths", [_D_LINE])
+    waves = found.get("wavelengths", [D_LINE])
     used = (min(waves), max(waves))
     word = target.words[2] if len(target.words) > 2 else ""
     medium = found["object_material"] = read_glass(word, file, used, f"{where}: surface SO")
@@ -183,7 +192,7 @@ def _solved(
                 )
             return last
     model = index_model("dfc")
-    wavelength = found.get("reference_wavelength", _D_LINE)
+    wavelength = found.get("reference_wavelength", D_LINE)
     sense, indices = 1.0, []
     media = [found["object_material"], *(surface.medium for surface in surfaces)]
     mirrors = [False, *(surface.material == "mirror" for surface in surfaces)]

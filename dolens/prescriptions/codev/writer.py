@@ -1,32 +1,37 @@
 """A prescription is written as the text of a CODE V `.seq` file."""
 
 import math
-import re
 from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.build import lens_from_prescription
-from dolens.prescriptions.checks import as_integer, as_number
-from dolens.prescriptions.codev.apertures import aperture_lines
-from dolens.prescriptions.codev.axes import break_words
 from dolens.prescriptions.codev.glass import glass_word, private_glass
+from dolens.prescriptions.codev.placement import aperture_lines, break_words
 from dolens.prescriptions.codev.reader import read_codev
-from dolens.prescriptions.codev.special import special_lines
-from dolens.prescriptions.compare import require_same
-from dolens.prescriptions.media import canonical_digits
+from dolens.prescriptions.codev.surface import (
+    LETTERS,
+    SPECIALS,
+    number_lines,
+    special_lines,
+)
+from dolens.prescriptions.numbers import as_integer, as_number, number_text
+from dolens.prescriptions.other_programs import (
+    require_dfc,
+    require_same,
+    slot_values,
+    written_wavelengths,
+)
+from dolens.prescriptions.row_data import canonical_digits
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 _TYPES = (
-    *("plane", "aperture", "sphere", "conic", "even_asphere", "xy_polynomial", "q_bfs"),
-    "odd_asphere",
+    *("plane", "aperture", "sphere", "conic", "even_asphere"),
+    *(special.type for special in SPECIALS.values()),
     "coordinate_break",
 )
-_D_LINE = 587.5618
 _INFINITY = "1e13"
-_POWER = re.compile(r"a(\d+)")
-_LETTERS = dict(zip(range(4, 22, 2), "ABCDEFGHJ", strict=True))
 _FIELDS = {"angles": "AN", "heights": "OB", "image_heights": "IM", "real_image_heights": "RI"}
 _PUPILS = {
     "entrance_pupil_diameter": "EPD",
@@ -48,12 +53,7 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     Raises:
         InputError: one line that names the surface and key which the format cannot hold.
     """
-    model = str(prescription.get("index_model", "dfc"))
-    if model != "dfc":
-        raise InputError(
-            f"{where}: a .seq file cannot hold index_model '{model}' (allowed: dfc; its nd and Vd "
-            "are those of the lines C, d, F, and its air has index 1)"
-        )
+    require_dfc(prescription, ".seq", where)
     surfaces = {str(n): row for n, row in prescription["surfaces"].items()}
     stop = str(as_integer(prescription.get("stop", 1), f"{where}: 'stop'"))
     for n, row in surfaces.items():
@@ -65,12 +65,12 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     remarks = [f"! {line}" for line in str(prescription.get("source") or "").splitlines()]
     lines = [*remarks, "RDM;LEN", *_system(prescription, where), *_private(prescription, surfaces)]
     distance = prescription.get("object_distance")
-    far = _INFINITY if distance is None else _text(distance, where)
+    far = _INFINITY if distance is None else number_text(distance, where)
     medium = prescription.get("object_material", "air")
     lines.append(f"SO    0.0 {far} {_glass(medium, f'{where}: object')}".rstrip())
     sensor = prescription["sensor"]
     for n, row in surfaces.items():
-        gap = _text(row.get("thickness", sensor["distance"]), f"{where}: surface {n}")
+        gap = number_text(row.get("thickness", sensor["distance"]), f"{where}: surface {n}")
         lines += _surface(row, gap, n == stop, f"{where}: surface {n}")
     lines += [*_image(sensor, where), "GO", ""]
     text = "\n".join(lines)
@@ -80,25 +80,21 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
 
 
 def _system(prescription: Mapping[str, Any], where: str) -> list[str]:
-    waves = prescription.get("wavelengths") or [_D_LINE]
-    waves = [as_number(wave, f"{where}: 'wavelengths'") for wave in waves]
-    reference = float(prescription.get("reference_wavelength") or waves[0])
-    if reference not in waves:
-        raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
+    waves, reference = written_wavelengths(prescription, where)
     weights = prescription.get("wavelength_weights")
     lines = [
         *_title(prescription),
         *_pupil(prescription, where),
         "DIM   M",
         f"WL    {_texts(waves, where)}",
-        f"REF   {waves.index(reference) + 1}",
+        f"REF   {reference}",
         *([f"WTW   {_texts(weights, where)}"] if weights else []),
         *_fields(prescription.get("fields") or {"angles": [[0.0, 0.0]]}, where),
     ]
     if prescription.get("temperature") is not None:
-        lines.append(f"TEM   {_text(prescription['temperature'], where)}")
+        lines.append(f"TEM   {number_text(prescription['temperature'], where)}")
     if prescription.get("pressure") is not None:
-        pressure = Decimal(_text(prescription["pressure"], where)) * 760
+        pressure = Decimal(number_text(prescription["pressure"], where)) * 760
         lines.append(f"PRE   {pressure}")
     return lines
 
@@ -116,7 +112,7 @@ def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
     lines = ["TEL   Y"] if prescription.get("telecentric_object") else []
     for key in PUPIL_KEYS:
         if prescription.get(key) is not None and key in _PUPILS:
-            return [*lines, f"{_PUPILS[key]:5} {_text(prescription[key], where)}"]
+            return [*lines, f"{_PUPILS[key]:5} {number_text(prescription[key], where)}"]
     return [*lines, f"EPD   {_entrance_pupil(prescription, where)}"]
 
 
@@ -150,7 +146,7 @@ def _fields(fields: Mapping[str, Any], where: str) -> list[str]:
         cut: dict[str, list[str]] = {"U": [], "L": []}
         for row in fields["vignetting"]:
             shift, part = (
-                Decimal(_text(row.get(f"{name}_{letter.lower()}", 0.0), where))
+                Decimal(number_text(row.get(f"{name}_{letter.lower()}", 0.0), where))
                 for name in ("decenter", "compression")
             )
             cut["U"].append(str(part - shift))
@@ -182,7 +178,7 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
     glass = _glass(row.get("material"), place)
     radius, more = "0.0", []
     if row.get("curvature") is not None:
-        more.append(f"  CUY {_text(row['curvature'], place)}")
+        more.append(f"  CUY {number_text(row['curvature'], place)}")
     elif kind not in ("plane", "aperture", "xy_polynomial"):
         number = as_number(row.get("radius", math.inf), f"{place}: 'radius'", finite=False)
         if number == 0.0:
@@ -195,35 +191,22 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
     lines += {"sphere": ["  SPH"] if radius == "0.0" else [], "conic": ["  CON"]}.get(kind, [])
     if kind in ("conic", "even_asphere"):
         asphere = ["  ASP"] if kind == "even_asphere" else []
-        lines += [*asphere, f"  K {_text(row.get('conic', 0.0), place)}"]
-        lines += _coefficients(row, place)
-    if kind in ("xy_polynomial", "q_bfs", "odd_asphere"):
-        lines += special_lines(row, place)
+        lines += [*asphere, f"  K {number_text(row.get('conic', 0.0), place)}"]
+        lines += number_lines(slot_values(LETTERS, row, place, ".seq"))
+    lines += special_lines({**row, "type": kind}, place)
     return lines + aperture_lines(row, place)
-
-
-def _coefficients(row: Mapping[str, Any], place: str) -> list[str]:
-    lines = []
-    for key in row:
-        power = _POWER.fullmatch(key)
-        if power is None:
-            continue
-        letter = _LETTERS.get(int(power[1]))
-        if letter is None:
-            raise InputError(f"{place}: a .seq file cannot hold '{key}' (allowed: a4 to a20)")
-        value = as_number(row[key], f"{place}: '{key}'")
-        lines.append(f"  {letter} {value!r}" if value else f"  {letter} 0")
-    return lines
 
 
 def _image(sensor: Mapping[str, Any], where: str) -> list[str]:
     place = f"{where}: sensor"
     radius = sensor.get("radius")
-    lines = [f"SI    {_text(radius, place) if radius and math.isfinite(radius) else '0.0'} 0.0"]
+    lines = [
+        f"SI    {number_text(radius, place) if radius and math.isfinite(radius) else '0.0'} 0.0"
+    ]
     if sensor.get("curvature") is not None:
-        lines.append(f"  CUY {_text(sensor['curvature'], place)}")
+        lines.append(f"  CUY {number_text(sensor['curvature'], place)}")
     if sensor.get("conic"):
-        lines += ["  CON", f"  K {_text(sensor['conic'], place)}"]
+        lines += ["  CON", f"  K {number_text(sensor['conic'], place)}"]
     if sensor.get("diameter"):
         lines.append(f"  CIR {as_number(sensor['diameter'], place) / 2.0!r}")
     return lines
@@ -239,8 +222,4 @@ def _glass(material: object, place: str) -> str:
 
 
 def _texts(values: Any, where: str) -> str:
-    return " ".join(_text(value, where) for value in values)
-
-
-def _text(value: object, place: str) -> str:
-    return repr(as_number(value, place))
+    return " ".join(number_text(value, where) for value in values)

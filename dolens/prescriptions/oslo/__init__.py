@@ -1,1 +1,0 @@
-"""OSLO lens files (`.len`, as text) are read."""
