@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.limits import GRAZING
 from dolens.optics.elements import LENS_AXES, change_axes
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
@@ -194,7 +193,7 @@ def _why_missed(surface: SurfaceState, here: Components, sense: float) -> str:
         if shape.closed_form:
             return "missed: the ray passes beside the surface"
         return "missed: Newton's iteration found no intersection"
-    if float(sense * (n - l * sx - m * sy)) <= GRAZING:
+    if float(sense * (n - l * sx - m * sy)) <= 0.0:
         return "missed: the ray touches the surface and does not cross it in the sense of the light"
     return f"missed: {height:.4f} mm from the axis, beyond the sag branch of the vertex"
 
