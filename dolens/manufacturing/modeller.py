@@ -242,8 +242,9 @@ def tensor_spline(face: Face, reach: float, used: float, tolerance: float) -> Te
             return spline
         spans *= 2
     raise InputError(
-        f"surface {face.number}: no spline of up to {_MOST_SPANS} × {_MOST_SPANS} spans follows "
-        f"its sag to {1e6 * tolerance:g} nm (the last one was off by {1e6 * error:.3g} nm)"
+        f"surface {face.number}: no spline of up to {_MOST_SPANS_ACROSS} × {_MOST_SPANS_ACROSS} "
+        f"spans follows its sag to {1e6 * tolerance:g} nm (the last one was off by "
+        f"{1e6 * error:.3g} nm)"
     )
 
 

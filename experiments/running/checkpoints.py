@@ -287,10 +287,10 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
         value = found.get(key, kind())
         negative = isinstance(value, int) and (isinstance(value, bool) or value < 0)
         if not isinstance(value, kind) or negative:
-            raise InputError(f"{where}{path} is damaged: its {key} is {_shown(value)}")
+            raise InputError(f"{where}{path} is damaged: its {key} is {_type_and_value(value)}")
     for name, value in found["state_dict"].items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
-            raise InputError(f"{where}{path} is damaged: its {name} is {_shown(value)}")
+            raise InputError(f"{where}{path} is damaged: its {name} is {_type_and_value(value)}")
     return found
 
 

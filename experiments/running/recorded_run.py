@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from dolens.experiments.running.run_files import (
     walk,
 )
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.target_keys import Target, located
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 from dolens.files import resolved_path
 
@@ -115,10 +115,10 @@ def read_record(
     except HydraException as error:
         raise InputError(f"{folder / OVERRIDES} cannot be read ({one_line(error)})") from None
     config = _moved(config, job.output_dir, str(output))
-    if not trust:
-        refuse_untrusted(needing_trust(config, output), folder)
     info = info_of(folder)
     _check_classes(config, folder, info)
+    if not trust:
+        refuse_untrusted(needing_trust(config, output), folder)
     return RecordedRun(
         folder,
         config,
@@ -132,18 +132,27 @@ def read_record(
 
 
 def _check_classes(config: Any, folder: Path, info: Mapping[str, Any]) -> None:
-    """Refuse a run whose classes of dolens are not in this version of it."""
+    """Refuse a run whose classes of dolens are in no module of this version of it."""
     for path, value, _ in walk("", config):
         if not path.endswith("_target_") or not str(value).startswith("dolens."):
             continue
-        try:
-            located(Target(path.removesuffix("._target_"), value, ()))
-        except InputError:
+        if not _has_module(str(value)):
             commit = (info.get("git") or {}).get("commit") or "unknown"
             raise InputError(
                 f"{folder}: this version of dolens has no {value}; the run was made by commit "
                 f"{commit}, which can read and repeat it"
-            ) from None
+            )
+
+
+def _has_module(name: str) -> bool:
+    """Return whether the module of a class or of its method exists; only packages are imported."""
+    parts = name.split(".")
+    for count in range(len(parts) - 1, 0, -1):
+        try:
+            return find_spec(".".join(parts[:count])) is not None
+        except ModuleNotFoundError:  # within a class, or within what does not exist
+            continue
+    return False
 
 
 def _check_folder(folder: Path) -> None:

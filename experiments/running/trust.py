@@ -10,25 +10,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import torch
-from lightning.pytorch import callbacks
-
-import dolens.optimize
-import dolens.reconstruction
 from dolens.errors import InputError
 from dolens.experiments.running.run_files import walk
 from dolens.files import packaged_configuration, resolved_path
 
 _TARGET = re.compile(r"_target_: *(?:([\w.]+))")
 # Of which packages every class of a kind is allowed, by the name that the package gives it.
-_KINDS = (
-    (torch.nn, torch.nn.Module),
-    (torch.optim, torch.optim.Optimizer),
-    (torch.optim.lr_scheduler, torch.optim.lr_scheduler.LRScheduler),
-    (callbacks, callbacks.Callback),
-    (dolens.reconstruction, torch.nn.Module),
-    (dolens.optimize, torch.optim.Optimizer),
-)
 # Parts of a run that a finished run does not make.
 _NOT_MADE = ("logger", "hydra")
 # Settings that say where something is written.
@@ -44,12 +31,27 @@ def allowed_targets() -> frozenset[str]:
     They are what the configuration of dolens itself names, and the networks, losses, optimizers,
     schedules and callbacks of torch, Lightning and dolens.
     """
+    # Slow to load, and workers load this module.
+    import torch
+    from lightning.pytorch import callbacks
+
+    import dolens.optimize
+    import dolens.reconstruction
+
+    kinds = (
+        (torch.nn, torch.nn.Module),
+        (torch.optim, torch.optim.Optimizer),
+        (torch.optim.lr_scheduler, torch.optim.lr_scheduler.LRScheduler),
+        (callbacks, callbacks.Callback),
+        (dolens.reconstruction, torch.nn.Module),
+        (dolens.optimize, torch.optim.Optimizer),
+    )
     files = packaged_configuration().rglob("*.yaml")
     named = {name for file in files for name in _TARGET.findall(file.read_text(encoding="utf-8"))}
     own = {name for name in named if name.startswith(("dolens.", "lightning.", "datetime."))}
     of_kinds = (
         {f"{home.__name__}.{name}", f"{made.__module__}.{made.__qualname__}"}
-        for home, kind in _KINDS
+        for home, kind in kinds
         for name, made in vars(home).items()
         if isinstance(made, type) and issubclass(made, kind)
     )
