@@ -15,7 +15,6 @@ from dolens.experiments.running.run_files import walk
 from dolens.files import packaged_configuration, resolved_path
 
 _TARGET = re.compile(r"_target_: *(?:([\w.]+))")
-# Of which packages every class of a kind is allowed, by the name that the package gives it.
 # Parts of a run that a finished run does not make.
 _NOT_MADE = ("logger", "hydra")
 # Settings that say where something is written.
@@ -38,6 +37,7 @@ def allowed_targets() -> frozenset[str]:
     import dolens.optimize
     import dolens.reconstruction
 
+    # Every class of a kind is allowed, by the name that its package gives it.
     kinds = (
         (torch.nn, torch.nn.Module),
         (torch.optim, torch.optim.Optimizer),
