@@ -226,15 +226,13 @@ def check_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
 
 
 def search_figures(finds: Finds, reports: Sequence[FormReport], name: str) -> Figures:
-    """Return the sections of all forms, the search's course and the map of starts.
-
-    Starts of a single element differ in nothing that a map could show, and have none.
-    """
+    """Return the sections of all forms, the search's course and the map of starts."""
     if not finds.found:
         return {}
     found: dict[str, Callable[[], Figure]] = {"course": lambda: course_picture(finds, name)}
-    if all(features.shape[1] > 1 for features in finds.features.values()):
-        found["starts"] = lambda: starts_picture(finds, name)
+    starts = starts_picture(finds, name)
+    if starts is not None:
+        found["starts"] = lambda: starts
     sections = sections_figure(reports, f"{name}: mean RMS spot of each form")
     return found if sections is None else {"forms": lambda: sections, **found}
 
@@ -248,8 +246,10 @@ def course_picture(finds: Finds, name: str) -> Figure:
     )
 
 
-def starts_picture(finds: Finds, name: str) -> Figure:
-    """Draw which start led where."""
+def starts_picture(finds: Finds, name: str) -> Figure | None:
+    """Draw which start led where; None for single elements, whose starts have no map."""
+    if any(features.shape[1] < 2 for features in finds.features.values()):
+        return None
     course = finds.course()
     firsts = sorted(finds.features)
     features = torch.cat([finds.features[first] for first in firsts])
