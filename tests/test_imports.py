@@ -32,6 +32,7 @@ rays = dolens.Rays(torch.zeros(20, 3) - 1.0, torch.tensor([0.0, 0.0, 1.0]), 550.
 lens.trace(rays).position.sum().backward()
 lens.first_order(), lens.seidel(10.0)
 assert not loaded("sympy")
+assert not loaded("dolens.prescriptions.zemax", "dolens.prescriptions.codev")
 lens.chief_ray((0.0, 10.0)), layout_figure(lens)
 assert not loaded("numba")
 

@@ -7,20 +7,11 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from dolens.errors import InputError
 from dolens.files import decode_text, much_at_once, without_controls
-from dolens.prescriptions.codev.reader import read_codev
-from dolens.prescriptions.codev.writer import codev_of
-from dolens.prescriptions.deeplens_json import read_deeplens
-from dolens.prescriptions.diffoptics_text import (
-    diffoptics_text_of,
-    object_radius,
-    prescription_from_diffoptics,
-)
-from dolens.prescriptions.optiland_json import read_optiland
-from dolens.prescriptions.oslo import read_oslo
 from dolens.prescriptions.other_programs import ReadPrescription, curved_object
 from dolens.prescriptions.plain_values import (
     Watched,
@@ -30,10 +21,6 @@ from dolens.prescriptions.plain_values import (
     read_yaml,
     yaml_of,
 )
-from dolens.prescriptions.ray_optics_json import read_ray_optics
-from dolens.prescriptions.zemax.file import encode_zemax
-from dolens.prescriptions.zemax.reader import read_zemax
-from dolens.prescriptions.zemax.writer import zemax_of
 
 # A lens is text of some kilobytes; more is no lens.
 MOST_BYTES = 64 * 2**20
@@ -86,6 +73,17 @@ class LensFormat:
     write: Callable[[Mapping[str, Any], str], bytes] | None
 
 
+def _later(name: str) -> Callable[..., Any]:
+    """Return a function of the package `prescriptions` that is imported when it is called: most
+    programs load no file of others.
+    """
+
+    def call(*arguments: Any) -> Any:
+        return resolve_name(f"dolens.prescriptions.{name}")(*arguments)
+
+    return call
+
+
 def _lines(*patterns: str) -> tuple[re.Pattern[str], ...]:
     """Return expressions for whole lines: they look at no line twice, however long it is."""
     return tuple(re.compile(rf"^{pattern}[ \t\r]*$", re.MULTILINE) for pattern in patterns)
@@ -103,6 +101,8 @@ def _is_of(text: str, signs: tuple[re.Pattern[str], ...]) -> bool:
 
 
 def _read_diffoptics(text: str, where: str) -> ReadPrescription:
+    from dolens.prescriptions.diffoptics_text import object_radius, prescription_from_diffoptics
+
     prescription = prescription_from_diffoptics(text, where)
     radius = object_radius(text, where)
     return ReadPrescription(
@@ -119,9 +119,9 @@ def _is_deeplens(content: dict[str, Any]) -> bool:
 
 # Programs that write JSON, as the keys of their files tell.
 _JSON_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], _JsonReader], ...] = (
-    (lambda content: "surface_group" in content, read_optiland),
-    (_is_deeplens, read_deeplens),
-    (lambda content: "optical_model" in content, read_ray_optics),
+    (lambda content: "surface_group" in content, _later("optiland_json:read_optiland")),
+    (_is_deeplens, _later("deeplens_json:read_deeplens")),
+    (lambda content: "optical_model" in content, _later("ray_optics_json:read_ray_optics")),
 )
 
 
@@ -159,22 +159,22 @@ FORMATS: tuple[LensFormat, ...] = (
         "Zemax",
         (".zmx",),
         _lines(r"SURF 0"),
-        read_zemax,
-        lambda prescription, where: encode_zemax(zemax_of(prescription, where)),
+        _later("zemax.reader:read_zemax"),
+        lambda *given: _later("zemax.file:encode_zemax")(_later("zemax.writer:zemax_of")(*given)),
     ),
     LensFormat(
         "OSLO",
         (".len", ".osl"),
         _lines(r"[ \t]*(?i:LEN[ \t]+NEW)\b.*"),
-        read_oslo,
+        _later("oslo:read_oslo"),
         None,
     ),
     LensFormat(
         "CODE V",
         (".seq",),
         _lines(r"[ \t]*(?i:SO)[ \t]+[-+.\d].*", r"[ \t]*(?i:SI)\b.*"),
-        read_codev,
-        lambda prescription, where: codev_of(prescription, where).encode(),
+        _later("codev.reader:read_codev"),
+        lambda *given: _later("codev.writer:codev_of")(*given).encode(),
     ),
     LensFormat("JSON", (".json",), (re.compile(r"\A\s*\{"),), read_json, json_of),
     # Of ray-optics; its JSON is found by its content.
@@ -184,7 +184,7 @@ FORMATS: tuple[LensFormat, ...] = (
         (".txt",),
         (),
         _read_diffoptics,
-        lambda prescription, where: diffoptics_text_of(prescription, where).encode(),
+        lambda *given: _later("diffoptics_text:diffoptics_text_of")(*given).encode(),
     ),
 )
 SUFFIXES = tuple(suffix for each in FORMATS for suffix in each.suffixes)
