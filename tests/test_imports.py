@@ -26,14 +26,17 @@ assert not above, above
 # A few rays and a drawing need no compiler, and rays no SymPy, which some functions of PyTorch
 # import: half a second.
 import torch, dolens
-from dolens.plotting import layout_figure
 lens = dolens.load_lens("conf/lens/nikon.yaml")
 rays = dolens.Rays(torch.zeros(20, 3) - 1.0, torch.tensor([0.0, 0.0, 1.0]), 550.0)
 lens.trace(rays).position.sum().backward()
 lens.first_order(), lens.seidel(10.0)
-assert not loaded("sympy")
+# A lens in the terminal needs no drawing, and aiming a ray no compiler of PyTorch's.
+from dolens.lens_page.overview import lens_overview, prepared_lens
+lens.chief_ray((0.0, 10.0))
+assert not loaded("sympy", "torch._dynamo", "matplotlib")
 assert not loaded("dolens.prescriptions.zemax", "dolens.prescriptions.codev")
-lens.chief_ray((0.0, 10.0)), layout_figure(lens)
+from dolens.plotting import layout_figure
+layout_figure(lens)
 assert not loaded("numba")
 
 # A lens on the CPU loads no kernels for GPUs.

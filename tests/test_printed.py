@@ -27,7 +27,7 @@ from dolens import load_lens, save_lens
 from dolens.cli.app import app
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.user_configuration import use_working_folder
-from dolens.lens_page import Written
+from dolens.lens_page.page import Written
 from dolens.optimize import DesignVariables, MeritSettings
 from dolens.prescriptions import lens_from_prescription
 from tests.experiments.conftest import composing

@@ -136,7 +136,7 @@ def _check_page(page: Path, lens: Path, force: bool) -> None:
     """Refuse to write a page over something else before work begins."""
     from dolens.errors import InputError
     from dolens.files import check_written
-    from dolens.lens_page import is_page
+    from dolens.lens_page.page import is_page
 
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--html: a page's file ends in .html, not '{page.name}'")
@@ -215,7 +215,7 @@ def _write(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from dolens.errors import readable
-    from dolens.lens_page import write_page
+    from dolens.lens_page.page import write_page
 
     progress = Progress(
         TextColumn("{task.description:<34}"),

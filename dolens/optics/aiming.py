@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.optics.autograd import is_transformed
 from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Components, Rays
@@ -321,11 +322,17 @@ def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
         return _miss(system, wavelength, near, turned, t[..., None] * target, q)
 
     copies = (q.expand(2, *q.shape).contiguous(), t.expand(2, *t.shape).contiguous())
-    found: Any = torch.func.vjp(miss, *copies, has_aux=True)
-    residual, pull_back, reached = found
     # Of the first copy the x is derived, of the second the y.
     component = torch.eye(2, dtype=q.dtype, device=q.device).reshape(2, *(1,) * t.ndim, 2)
-    of_q, of_t = pull_back(component.expand(residual.shape))
+    if torch.is_inference_mode_enabled() or is_transformed():
+        found: Any = torch.func.vjp(miss, *copies, has_aux=True)
+        residual, pull_back, reached = found
+        of_q, of_t = pull_back(component.expand(residual.shape))
+    else:  # torch.func.vjp loads PyTorch's compiler, and a cotangent SymPy: seconds
+        with torch.enable_grad():
+            copies = (copies[0].detach().requires_grad_(), copies[1].detach().requires_grad_())
+            residual, reached = miss(*copies)
+            of_q, of_t = torch.autograd.grad((component * residual).sum(), copies)
     return _Evaluation(
         residual[0].detach(),
         torch.stack((of_q[0], of_q[1]), -2).detach(),

@@ -17,6 +17,11 @@ from torch.func import jvp, vmap
 _TOGETHER = 8
 
 
+def is_transformed() -> bool:
+    """Return whether a transform of `torch.func` (vmap, jvp, vjp) is at work."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
+
+
 def jacobian_of(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
     """∂values/∂variables, (N, P), by one batch of N reverse sweeps.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from dolens.errors import InputError
+from dolens.optics.autograd import is_transformed
 from dolens.optics.eager_trace import trace_by_operator, trace_eagerly, traces_eagerly
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.packing import lay_out, unsupported
@@ -347,7 +348,7 @@ def _transformed(tensors: Iterable[Tensor]) -> bool:
     """Return whether any tensor is seen through torch.func, or carries a tangent."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     forward = forward_ad._current_level >= 0
-    if not forward and torch._C._functorch.peek_interpreter_stack() is None:
+    if not forward and not is_transformed():
         return False
     return any(
         wrapped(t) or (forward and forward_ad.unpack_dual(t).tangent is not None) for t in tensors

@@ -115,7 +115,7 @@ def at_work(work, monkeypatch):
     """Nothing is drawn and no picture restored: what is refused is refused before."""
     monkeypatch.chdir(work)
     monkeypatch.setenv("COLUMNS", "400")
-    monkeypatch.setattr("dolens.lens_page.write_page", lambda *_, **__: Written())
+    monkeypatch.setattr("dolens.lens_page.page.write_page", lambda *_, **__: Written())
     nothing = SimpleNamespace(name="", summary="", sections=[])
     monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda _: nothing)
     for name in ("apply", "restore"):

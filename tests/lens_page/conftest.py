@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from dolens.lens_page import write_page
+from dolens.lens_page.page import write_page
 from dolens.prescriptions import lens_from_prescription
 from tests.prescriptions.samples import SINGLET
 

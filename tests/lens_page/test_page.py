@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens
-from dolens.lens_page import is_page, write_page
 from dolens.lens_page.overview import lens_overview, prepared_lens
-from dolens.lens_page.page import _with_few_fields
+from dolens.lens_page.page import _with_few_fields, is_page, write_page
 from tests.lens_page.conftest import HOSTILE
 
 SECTIONS = [

@@ -11,7 +11,7 @@ from dolens.analysis.spot_diagram import spot_diagram
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
-from dolens.lens_page import write_page
+from dolens.lens_page.page import write_page
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.plotting import layout_figure
 from dolens.prescriptions import lens_from_prescription
