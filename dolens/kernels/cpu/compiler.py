@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from llvmlite import binding, ir
 from numba import types
 from numba.core import config, event
@@ -39,6 +40,7 @@ INTEGERS = types.CPointer(types.int64)
 REALS = {"float32": types.float32, "float64": types.float64}
 
 Factory = Callable[[types.Type], Callable[..., None]]
+Row = Sequence[int] | np.ndarray  # a step's codes
 
 _lock = threading.RLock()
 
@@ -141,7 +143,8 @@ def stamped_sources() -> list[Path]:
     limits are among them.
     """
     here = Path(__file__).parent
-    return [*sorted(here.rglob("*.py")), here.parent / "limits.py", here.parent / "table.py"]
+    above = ("limits.py", "table.py", "shapes.py")
+    return [*sorted(here.rglob("*.py")), *(here.parent / name for name in above)]
 
 
 @cache
@@ -156,17 +159,19 @@ def stamp() -> str:
 def source_of(factory: Factory) -> tuple[str, ...]:
     """Return what tells a kernel on disk from others: its name, and a digest of its own file.
 
-    A kernel that inlines a user's functions, which its factory wraps, goes by these.
+    A kernel that inlines others' functions, which its factory wraps or has `within`, goes by these.
 
     Raises:
         RuntimeError: they stand in no file, as in a notebook.
     """
     function = inspect.unwrap(factory)
-    path = Path(inspect.getsourcefile(function) or "")
-    if not path.is_file():
-        raise RuntimeError(f"the source of {function.__qualname__} is in no file")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return function.__module__, function.__qualname__, factory.__name__, digest
+    digest = hashlib.sha256()
+    for one in getattr(factory, "within", (function,)):
+        path = Path(inspect.getsourcefile(one) or "")
+        if not path.is_file():
+            raise RuntimeError(f"the source of {one.__qualname__} is in no file")
+        digest.update(path.read_bytes())
+    return function.__module__, function.__qualname__, factory.__name__, digest.hexdigest()
 
 
 _kernels: dict[tuple[Factory, str], int] = {}
@@ -306,6 +311,7 @@ class StepFunctions:
         parameters: cotangents of the shape's numbers from those of sag and slopes.
         starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
             starts; else it starts on the vertex plane.
+        on_asphere: `sag` and the others call those of an even asphere first, by their addresses.
         stencil: a ray depends on 4×4 neighbours among the shape's last COUNT·COLUMNS numbers only,
             and has cotangents for these alone.
         scratch: work rows of the shape's own, by its row of codes.
@@ -318,6 +324,11 @@ class StepFunctions:
     sag_hessian: Factory | None = None
     parameters: Factory | None = None
     starts_on_conic: bool = False
+    on_asphere: bool = False
     stencil: bool = False
     scratch: Callable[[Sequence[int]], int] = _none
     numbers: int | None = None
+
+    def of(self, row: Row) -> "StepFunctions":
+        """Return the functions of a step with this row of codes: these, whatever it says."""
+        return self

@@ -15,23 +15,21 @@ from typing import Any
 from numba import carray, njit, types
 
 from dolens.kernels.cpu import jacobi as polynomials
-from dolens.kernels.cpu.compiler import OPTIONS, shifted
-from dolens.kernels.cpu.even_asphere import (
-    COEFFICIENTS,
-    OF_COEFFICIENTS,
-    even_asphere_hessian,
-    even_asphere_parameters,
-    even_asphere_sag,
-)
+from dolens.kernels.cpu.compiler import OPTIONS, call_block, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.jacobi import jacobi
 from dolens.kernels.cpu.layout import (
+    ASPHERE_HESSIAN,
+    ASPHERE_PARAMETERS,
+    ASPHERE_SAG,
+    BEHIND_ASPHERE,
     BLOCK,
     CODE_ROW,
     COLUMNS,
     DEGREE,
     FURTHER,
     MARGIN,
+    OF_BEHIND_ASPHERE,
     OF_SAG,
     OF_SECOND,
     OF_SHAPE,
@@ -130,15 +128,14 @@ def _parts(real: types.Type) -> tuple[Any, Any, Any, Any, Any]:
 
 def forbes_sag(real: types.Type) -> Callable[..., None]:
     """Add the departure to the rows of sag and slopes; the margin is that of the branch."""
-    conic = njit(**OPTIONS)(even_asphere_sag(real))
     _, begin, total, departure, _ = _parts(real)
     one, two, steepest = real(1.0), real(2.0), real(STEEPEST)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        conic(before, after, cotangents, record, work, codes)
         w, codes_row = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(codes_row[ASPHERE_SAG], before, after, cotangents, record, work, codes)
         best_fit = codes_row[DEGREE]
-        own = carray(shifted(record, COEFFICIENTS), UNBOUNDED)
+        own = carray(shifted(record, BEHIND_ASPHERE), UNBOUNDED)
         c, k_base = carray(record, UNBOUNDED)[SHAPE], carray(record, UNBOUNDED)[SHAPE + 1]
         scale = one / (own[0] * own[0])
         kappa = c * c * own[0] * own[0]
@@ -161,15 +158,14 @@ def forbes_sag(real: types.Type) -> Callable[..., None]:
 
 def forbes_hessian(real: types.Type) -> Callable[..., None]:
     """Add the departure to the rows of slopes and second derivatives."""
-    conic = njit(**OPTIONS)(even_asphere_hessian(real))
     _, begin, total, departure, _ = _parts(real)
     one, two, four = real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        conic(before, after, cotangents, record, work, codes)
         w, codes_row = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(codes_row[ASPHERE_HESSIAN], before, after, cotangents, record, work, codes)
         best_fit = codes_row[DEGREE]
-        own = carray(shifted(record, COEFFICIENTS), UNBOUNDED)
+        own = carray(shifted(record, BEHIND_ASPHERE), UNBOUNDED)
         c, k_base = carray(record, UNBOUNDED)[SHAPE], carray(record, UNBOUNDED)[SHAPE + 1]
         scale = one / (own[0] * own[0])
         kappa = c * c * own[0] * own[0]
@@ -197,17 +193,16 @@ def forbes_parameters(real: types.Type) -> Callable[..., None]:
     Λ = σ'/σ = κ/(2ab), σ_κ = σ·q/(2ab), σ_k = σ·κ²q²/(2ab), Λ_κ = (1 + κq·(k·b + (1+k)·a)/(ab))/
     (2ab) and Λ_k = κ²q·(a + b)/(2a²b²).
     """
-    conic = njit(**OPTIONS)(even_asphere_parameters(real))
     step, _, _, departure, secant_of = _parts(real)
     begin_polynomials, advance = jacobi(real)[1:]
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        conic(before, after, cotangents, record, work, codes)
         w, codes_row = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(codes_row[ASPHERE_PARAMETERS], before, after, cotangents, record, work, codes)
         cot = carray(cotangents, UNBOUNDED)
         best_fit = codes_row[DEGREE]
-        own = carray(shifted(record, COEFFICIENTS), UNBOUNDED)
+        own = carray(shifted(record, BEHIND_ASPHERE), UNBOUNDED)
         c, k_base = carray(record, UNBOUNDED)[SHAPE], carray(record, UNBOUNDED)[SHAPE + 1]
         scale, square = one / (own[0] * own[0]), own[0] * own[0]
         kappa = c * c * square
@@ -218,7 +213,7 @@ def forbes_parameters(real: types.Type) -> Callable[..., None]:
             along = w[OF_SLOPE_X + i] * w[POINT_X + i] + w[OF_SLOPE_Y + i] * w[POINT_Y + i]
             of_slope = two * scale * along
             w[T + i] = of_slope
-            cot[OF_COEFFICIENTS + i] = zero
+            cot[OF_BEHIND_ASPHERE + i] = zero
             if best_fit != 0:
                 a, b, secant = secant_of(q, k_base, kappa)
                 inverse = one / (a * b)
@@ -238,7 +233,7 @@ def forbes_parameters(real: types.Type) -> Callable[..., None]:
             if k > 0:
                 a, b, c_k = step(k, best_fit)
                 advance(rows, shifted(work, QUADRANCE), a, b, c_k)
-            out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * (k + 1)), BLOCK)
+            out = carray(shifted(cotangents, OF_BEHIND_ASPHERE + BLOCK * (k + 1)), BLOCK)
             for i in range(BLOCK):
                 d, d1, _, _, _ = departure(
                     w[QUADRANCE + i], w[VALUE + i], w[SLOPE + i], zero, k_base, kappa, best_fit
@@ -254,5 +249,10 @@ def _rows(row: Sequence[int]) -> int:
 
 
 KERNELS = given_by_sag(
-    forbes_sag, forbes_hessian, forbes_parameters, starts_on_conic=True, scratch=_rows
+    forbes_sag,
+    forbes_hessian,
+    forbes_parameters,
+    starts_on_conic=True,
+    on_asphere=True,
+    scratch=_rows,
 )

@@ -11,21 +11,19 @@ from typing import Any
 
 from numba import carray, njit, types
 
-from dolens.kernels.cpu.compiler import OPTIONS
-from dolens.kernels.cpu.even_asphere import (
-    COEFFICIENTS,
-    OF_COEFFICIENTS,
-    even_asphere_hessian,
-    even_asphere_parameters,
-    even_asphere_sag,
-)
+from dolens.kernels.cpu.compiler import OPTIONS, call_block
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
+    ASPHERE_HESSIAN,
+    ASPHERE_PARAMETERS,
+    ASPHERE_SAG,
+    BEHIND_ASPHERE,
     BLOCK,
     CODE_ROW,
     COUNT,
     FURTHER,
     MARGIN,
+    OF_BEHIND_ASPHERE,
     OF_SAG,
     OF_SLOPE_X,
     OF_SLOPE_Y,
@@ -75,15 +73,14 @@ def _rotation(real: types.Type) -> tuple[Any, Any, Any]:
 
 def toroid_sag(real: types.Type) -> Callable[..., None]:
     """Fill the rows of sag, slopes, and a margin that is positive where curve and circle are."""
-    section = njit(**OPTIONS)(even_asphere_sag(real))
     to_section, back, roots = _rotation(real)
     one, two = real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, p = carray(work, UNBOUNDED), carray(record, UNBOUNDED)
-        c = p[COEFFICIENTS + carray(codes, CODE_ROW)[COUNT]]
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        c = carray(record, UNBOUNDED)[BEHIND_ASPHERE + q[COUNT]]
         to_section(w)
-        section(before, after, cotangents, record, work, codes)
+        call_block(q[ASPHERE_SAG], before, after, cotangents, record, work, codes)
         back(w)
         for i in range(BLOCK):
             x, f, slope = w[POINT_X + i], w[SAG + i], w[SLOPE_Y + i]
@@ -106,17 +103,15 @@ def toroid_hessian(real: types.Type) -> Callable[..., None]:
 
     W·s_xx = c + c·s_x², W·s_xy = c·s_x·s_y and W·s_yy = g·f'' + c·(s_y² - f'²).
     """
-    section = njit(**OPTIONS)(even_asphere_hessian(real))
-    sag = njit(**OPTIONS)(even_asphere_sag(real))
     to_section, back, roots = _rotation(real)
     one = real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, p = carray(work, UNBOUNDED), carray(record, UNBOUNDED)
-        c = p[COEFFICIENTS + carray(codes, CODE_ROW)[COUNT]]
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        c = carray(record, UNBOUNDED)[BEHIND_ASPHERE + q[COUNT]]
         to_section(w)
-        sag(before, after, cotangents, record, work, codes)
-        section(before, after, cotangents, record, work, codes)
+        call_block(q[ASPHERE_SAG], before, after, cotangents, record, work, codes)
+        call_block(q[ASPHERE_HESSIAN], before, after, cotangents, record, work, codes)
         back(w)
         for i in range(BLOCK):
             x, f, slope, second = w[POINT_X + i], w[SAG + i], w[SLOPE_Y + i], w[SAG_YY + i]
@@ -139,14 +134,13 @@ def toroid_parameters(real: types.Type) -> Callable[..., None]:
     kernel takes the cotangents times g/W, and what the slopes of g/W add.  `toroid_hessian` has
     left f.
     """
-    section = njit(**OPTIONS)(even_asphere_parameters(real))
     to_section, back, roots = _rotation(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, p = carray(work, UNBOUNDED), carray(record, UNBOUNDED)
-        count = carray(codes, CODE_ROW)[COUNT]
-        c = p[COEFFICIENTS + count]
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        count = q[COUNT]
+        c = carray(record, UNBOUNDED)[BEHIND_ASPHERE + count]
         cot = carray(cotangents, UNBOUNDED)
         for i in range(BLOCK):
             x, f = w[POINT_X + i], w[CURVE + i]
@@ -161,13 +155,13 @@ def toroid_parameters(real: types.Type) -> Callable[..., None]:
             # (s² - f²)/2 without cancellation.
             lever = half * ((s - f) * (s + f) + x * x)
             of_lever = s * along + x * of_x - f * slope * of_y
-            cot[OF_COEFFICIENTS + BLOCK * count + i] = inverse * (
+            cot[OF_BEHIND_ASPHERE + BLOCK * count + i] = inverse * (
                 of_sag * lever + of_lever + c * lever * along * inverse
             )
             w[OF_SAG + i] = of_sag * ratio + c * (ratio * along - slope * of_y) * inverse
             w[OF_SLOPE_X + i], w[OF_SLOPE_Y + i] = zero, ratio * of_y
         to_section(w)
-        section(before, after, cotangents, record, work, codes)
+        call_block(q[ASPHERE_PARAMETERS], before, after, cotangents, record, work, codes)
         back(w)
 
     return kernel
@@ -178,4 +172,6 @@ def _rows(row: object) -> int:
     return ROWS
 
 
-KERNELS = given_by_sag(toroid_sag, toroid_hessian, toroid_parameters, scratch=_rows)
+KERNELS = given_by_sag(
+    toroid_sag, toroid_hessian, toroid_parameters, scratch=_rows, on_asphere=True
+)

@@ -11,14 +11,14 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
-from dolens.kernels.cuda.even_asphere import (
+from dolens.kernels.cuda.functions import SagFunctions
+from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
+from dolens.kernels.cuda.layout import COLUMNS, DEGREE, SHAPE
+from dolens.kernels.cuda.shapes import (
     even_asphere_hessian,
     even_asphere_sag,
     even_asphere_sums,
 )
-from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
-from dolens.kernels.cuda.layout import COLUMNS, DEGREE, SHAPE
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # the normalisation radius, and then the coefficients
 STEEPEST = tl.constexpr(1e-12)  # as in the reference

@@ -8,13 +8,13 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import GRAZING, TINY, add_sum, divide, safe_sqrt
-from dolens.kernels.cuda.even_asphere import (
+from dolens.kernels.cuda.functions import SagFunctions
+from dolens.kernels.cuda.layout import COUNT, SHAPE
+from dolens.kernels.cuda.shapes import (
     even_asphere_hessian,
     even_asphere_sag,
     even_asphere_sums,
 )
-from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.layout import COUNT, SHAPE
 
 C_X = tl.constexpr(int(SHAPE) + 3)  # its place where there are no even coefficients but a2
 

@@ -8,7 +8,7 @@ reaches; their gradient is cut off where the trace ends.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.kernels.table import Code
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
@@ -69,6 +70,28 @@ class PackedShape(NamedTuple):
     degree: int = 0
     extras: tuple[int, ...] = ()
     data: int = 0
+
+
+def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -> PackedShape:
+    """Return the numbers of a shape of plain functions for its kernels.
+
+    Args:
+        layout: of its `Shape`.
+        parts: what its functions take; a number that is no tensor is zero.
+        more: further fields of `PackedShape`.
+
+    A series is filled up to a multiple of four, and its length stands where the layout says.
+    """
+    fields = {Code.COUNT: "count", Code.COLUMNS: "columns", Code.DEGREE: "degree"}
+    numbers: list[Any] = []
+    for place, part in zip(layout, parts, strict=True):
+        if place is None:
+            numbers.append(part)
+        else:
+            numbers += (*part, *(-len(part) % 4) * (0.0,))
+            more[fields[place]] = len(part) + -len(part) % 4
+    tensors = (number if isinstance(number, Tensor) else None for number in numbers)
+    return PackedShape(tuple(tensors), **more)
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
