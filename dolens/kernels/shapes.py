@@ -45,7 +45,7 @@ class Shape:
     starts_on_conic: bool = False
 
     def __post_init__(self) -> None:
-        _named[self.name] = self
+        _named.setdefault(self.name, self)
 
 
 def shape_named(name: str) -> Shape:

@@ -11,14 +11,18 @@ from dolens.kernels import operations
 from dolens.kernels.cpu import compiler, shapes
 from dolens.kernels.cpu.layout import COLUMNS, COUNT
 from dolens.kernels.shapes import Shape, functions_within
+from dolens.optics.surfaces.biconic import BICONIC
 from dolens.optics.surfaces.even_asphere import EVEN_ASPHERE
 from dolens.optics.surfaces.odd_asphere import ODD_ASPHERE
+from dolens.optics.surfaces.toroid import TOROID
 
 F64 = torch.float64
 # Numbers of each shape, part by part.
 SHAPES = {
     EVEN_ASPHERE: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11)),
     ODD_ASPHERE: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11), 2e-3, (1e-5, 2e-6, -1e-8, 1e-10)),
+    BICONIC: (0.04, -0.03, -0.6, 0.8),
+    TOROID: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11), -0.05),
 }
 CASES = pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
 

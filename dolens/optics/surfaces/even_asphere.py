@@ -19,9 +19,8 @@ from dolens.kernels.operations import (
     safe_sqrt,
 )
 from dolens.kernels.shapes import Shape
-from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Code
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names, packed_as
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.conic import Conic, check_reach, conic_distance
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
@@ -118,7 +117,7 @@ class EvenAsphere(Conic):
     """
 
     kind = "even_asphere"
-    kernel = SurfaceKernel(shape=EVEN_ASPHERE)
+    shape = EVEN_ASPHERE
     rotational = True
 
     @classmethod
@@ -146,14 +145,13 @@ class EvenAsphere(Conic):
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Return sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
-        sag, sx, sy, exists = even_asphere_sag(cls.numbers(p), x, y)
-        return sag, sx, sy, exists.detach()
+        return super(Conic, cls).sag_and_gradient(p, x, y)
 
     @classmethod
     @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c, k, a2, and a4, a6, ...: all powers up to the highest, in groups of four."""
-        return packed_as(EVEN_ASPHERE.layout, cls.numbers(p))
+        return super(Conic, cls).packed(p)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

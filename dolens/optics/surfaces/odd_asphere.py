@@ -20,7 +20,6 @@ from dolens.kernels.operations import (
     where,
 )
 from dolens.kernels.shapes import Shape
-from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Code
 from dolens.optics.surfaces.base import PackedShape, Parameters, by_names, packed_as
 from dolens.optics.surfaces.even_asphere import (
@@ -123,7 +122,7 @@ class OddAsphere(AsphereWithTerms):
     """
 
     kind = "odd_asphere"
-    kernel = SurfaceKernel(shape=ODD_ASPHERE)
+    shape = ODD_ASPHERE
     rotational = True
 
     @classmethod
