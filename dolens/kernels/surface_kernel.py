@@ -24,8 +24,8 @@ class SurfaceKernel:
     """A surface has kernels for the CPU, for GPUs, or for both.
 
     A shape of plain functions has both from these.  Otherwise each module offers `KERNELS`: on the
-    CPU what `given_by_scalars` or `given_by_sag` returns, on GPUs a `SagFunctions`.  Where there is
-    none for a device, the reference in PyTorch traces there.
+    CPU what `given_by_sag` returns, on GPUs a `SagFunctions`.  Where there is none for a device,
+    the reference in PyTorch traces there.
 
     Args:
         cpu: the name of an importable module with Numba functions, or None.

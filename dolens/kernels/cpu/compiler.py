@@ -159,19 +159,18 @@ def stamp() -> str:
 def source_of(factory: Factory) -> tuple[str, ...]:
     """Return what tells a kernel on disk from others: its name, and a digest of its own file.
 
-    A kernel that inlines others' functions, which its factory wraps or has `within`, goes by these.
+    A kernel that inlines a shape's functions, which its factory has `within`, goes by these.
 
     Raises:
         RuntimeError: they stand in no file, as in a notebook.
     """
-    function = inspect.unwrap(factory)
     digest = hashlib.sha256()
-    for one in getattr(factory, "within", (function,)):
+    for one in getattr(factory, "within", (factory,)):
         path = Path(inspect.getsourcefile(one) or "")
         if not path.is_file():
             raise RuntimeError(f"the source of {one.__qualname__} is in no file")
         digest.update(path.read_bytes())
-    return function.__module__, function.__qualname__, factory.__name__, digest.hexdigest()
+    return factory.__module__, factory.__qualname__, factory.__name__, digest.hexdigest()
 
 
 _kernels: dict[tuple[Factory, str], int] = {}

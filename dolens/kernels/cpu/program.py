@@ -107,7 +107,7 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
         if functions.numbers not in (None, numbers):
             kernel = functions.sag or functions.forward
             raise InputError(
-                f"the CPU kernels '{kernel.__qualname__}' take {functions.numbers} numbers of a "
+                f"the CPU kernels '{kernel.__name__}' take {functions.numbers} numbers of a "
                 f"surface; its `packed` gives {numbers}"
             )
         row[FORWARD] = compiler.compile_block(functions.forward, real)

@@ -106,6 +106,18 @@ def _sag(record, codes, extras, x, y):
     return FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
 
 
+def _hessian(record, codes, extras, x, y):
+    sx, sy, sxx, sxy, syy = FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
+    # A derivative may be one for all rays.
+    return (
+        tl.broadcast_to(sx, x.shape),
+        tl.broadcast_to(sy, x.shape),
+        tl.broadcast_to(sxx, x.shape),
+        tl.broadcast_to(sxy, x.shape),
+        tl.broadcast_to(syy, x.shape),
+    )
+
+
 def _add_sums(record, codes, extras, sums, x, y, of_sag, of_x, of_y, alive):
     p = _unpacked(record + SHAPE, codes, LAYOUT)  # noqa: F821
     FUNCTION((sums + SHAPE, alive), p, x, y, of_sag, of_x, of_y)  # noqa: F821
@@ -127,7 +139,7 @@ def kernels(shape: Shape) -> SagFunctions:
 
     return SagFunctions(
         bound(_sag, shape.sag, "sag"),
-        bound(_sag, shape.sag_hessian, "hessian"),
+        bound(_hessian, shape.sag_hessian, "hessian"),
         bound(_add_sums, shape.parameters, "sums"),
         starts_on_conic=shape.starts_on_conic,
     )
