@@ -47,6 +47,8 @@ def safe_sqrt(squared: Number) -> Number:
 
 def where(condition: Any, a: Number, b: Number) -> Number:
     """Return a where the condition holds, and else b."""
+    if isinstance(condition, bool):
+        return a if condition else b
     return torch.where(condition, a, b)
 
 
@@ -55,8 +57,8 @@ def zero(like: Number) -> Number:
     return 0.0
 
 
-def number(integer: int) -> Number:
-    """Return an integer as a number, of the rays' precision: a literal has it by itself."""
+def number(integer: int, like: Number) -> Number:
+    """Return an integer as a number of another's precision; a literal has it by itself."""
     return float(integer)
 
 
@@ -73,6 +75,20 @@ def term(series: Series, i: int) -> Number:
 def put(cotangents: Any, place: int, value: Number) -> None:
     """Set the cotangent of the number at a place, in the order of the surface's `packed`."""
     cotangents[place] = value
+
+
+def by_radius(
+    x: Number, y: Number, slope: Number, second: Number
+) -> tuple[Number, Number, Number, Number, Number]:
+    """Return slopes and second derivatives of f(x² + y²), from f' and f''."""
+    bend = 4.0 * second
+    return (
+        2.0 * x * slope,
+        2.0 * y * slope,
+        2.0 * slope + x * x * bend,
+        x * y * bend,
+        2.0 * slope + y * y * bend,
+    )
 
 
 def horner(series: Series, q: Number) -> tuple[Number, Number]:
@@ -106,6 +122,6 @@ def put_powers(
     for group in range(count // 4):
         for k in range(4):
             upper = lower * q
-            weight = number(power + step * (4 * group + k)) * of_slope
+            weight = number(power + step * (4 * group + k), q) * of_slope
             put(cotangents, place + 4 * group + k, of_value * upper + weight * lower)
             lower = upper

@@ -84,8 +84,8 @@ def _operations(real: types.Type) -> dict[Any, Any]:
         return real(like), lambda context, *_: context.get_constant(real, 0.0)
 
     @intrinsic
-    def number(context, integer):  # noqa: ANN001, ANN202
-        return real(types.int64), lambda context, builder, _, given: builder.sitofp(
+    def number(context, integer, like):  # noqa: ANN001, ANN202
+        return real(types.int64, like), lambda context, builder, _, given: builder.sitofp(
             given[0], context.get_value_type(real)
         )
 

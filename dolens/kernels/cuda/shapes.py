@@ -44,9 +44,9 @@ def zero(like):
 
 
 @triton.jit
-def number(integer):
-    """Return an integer as a number; it takes the precision of the rays it meets."""
-    return integer + 0.0
+def number(integer, like):
+    """Return an integer as a number of another's precision; with a literal it would be single."""
+    return integer + tl.zeros_like(like)
 
 
 @triton.jit

@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.operations import (
     Number,
+    by_radius,
     divide,
     fma,
     horner,
@@ -21,7 +22,13 @@ from dolens.kernels.operations import (
 from dolens.kernels.shapes import Shape
 from dolens.kernels.table import Code
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
-from dolens.optics.surfaces.conic import Conic, check_reach, conic_distance
+from dolens.optics.surfaces.conic import (
+    Conic,
+    check_reach,
+    conic_cotangents,
+    conic_distance,
+    conic_slopes,
+)
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
 
@@ -58,42 +65,25 @@ def even_asphere_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Numb
 def even_asphere_hessian(
     p: Any, x: Number, y: Number
 ) -> tuple[Number, Number, Number, Number, Number]:
-    """Return slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
+    """Return slopes and second derivatives."""
     c, k, a2, a = p
     q = fma(x, x, y * y)
     h, d, e = horner_second(a, q)
-    ec2 = (1.0 + k) * c * c
-    root = safe_sqrt(1.0 - ec2 * q)
-    conic = divide(0.5 * c, root)
-    slope = conic + a2 + q * (2.0 * h + q * d)
-    second = divide(0.5 * conic * ec2, root * root) + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e
-    return (
-        2.0 * x * slope,
-        2.0 * y * slope,
-        2.0 * slope + 4.0 * x * x * second,
-        4.0 * x * y * second,
-        2.0 * slope + 4.0 * y * y * second,
-    )
+    slope, second = conic_slopes(c, k, q)
+    slope = slope + a2 + q * (2.0 * h + q * d)
+    return by_radius(x, y, slope, second + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e)
 
 
 def even_asphere_parameters(
     cotangents: Any, p: Any, x: Number, y: Number, of_sag: Number, of_x: Number, of_y: Number
 ) -> None:
-    """Give the cotangents of c, k, a2 and the further coefficients.
-
-    With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
-    its derivative in q, c/2R: 1/2R³ and c³q/4R³.
-    """
+    """Give the cotangents of c, k, a2 and the further coefficients."""
     c, k, _, a = p
-    e = 1.0 + k
     q = fma(x, x, y * y)
     of_slope = 2.0 * (of_x * x + of_y * y)
-    root = safe_sqrt(1.0 - e * c * c * q)
-    inverse = divide(1.0, root)
-    sag = divide(c * q, 1.0 + root)
-    cubed = 0.5 * of_slope * inverse * inverse * inverse
-    put(cotangents, 0, 0.5 * of_sag * inverse * (q + e * sag * sag) + cubed)
-    put(cotangents, 1, 0.5 * c * (of_sag * inverse * sag * sag + c * c * q * cubed))
+    of_c, of_k = conic_cotangents(c, k, q, of_sag, of_slope)
+    put(cotangents, 0, of_c)
+    put(cotangents, 1, of_k)
     put(cotangents, 2, of_sag * q + of_slope)
     put_powers(cotangents, 3, length(a), q, q, of_sag, of_slope, 2, 1)
 
