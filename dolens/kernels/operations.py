@@ -63,7 +63,7 @@ def number(integer: int, like: Number) -> Number:
 
 
 def length(series: Series) -> int:
-    """Return how many numbers a series has; a multiple of four."""
+    """Return how many numbers a series has."""
     return len(series)
 
 
@@ -117,11 +117,9 @@ def put_powers(
     """Set the cotangents of a series's numbers, from `place` on.
 
     That of number j is of_value·u_(j+1) + (power + step·j)·of_slope·u_j with u_j = lower·q^j.
-    Four at a time, or LLVM would not unroll the loop.
     """
-    for group in range(count // 4):
-        for k in range(4):
-            upper = lower * q
-            weight = number(power + step * (4 * group + k), q) * of_slope
-            put(cotangents, place + 4 * group + k, of_value * upper + weight * lower)
-            lower = upper
+    for j in range(count):
+        upper = lower * q
+        weight = number(power + step * j, q) * of_slope
+        put(cotangents, place + j, of_value * upper + weight * lower)
+        lower = upper

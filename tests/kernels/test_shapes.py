@@ -84,9 +84,9 @@ def test_cotangents_of_its_numbers_are_those_of_autograd(shape, points):
     torch.testing.assert_close(total, expected, rtol=1e-11, atol=1e-12)
 
 
-def kernels_of(shape):
+def kernels_of(shape, count=4):
     row = np.zeros(64, dtype=np.int64)
-    row[COUNT] = row[COLUMNS] = 4
+    row[COUNT] = row[COLUMNS] = count
     functions = shapes.kernels(shape).of(row)
     return functions.sag, functions.sag_hessian, functions.parameters
 
@@ -98,6 +98,13 @@ def test_kernels_of_single_precision_have_no_number_of_double_precision(shape):
         instructions = kernel.inspect_llvm()
         assert "fpext" not in instructions and "double" not in instructions
         assert "x float>" in instructions, "rays are taken several at a time"
+
+
+@pytest.mark.parametrize("shape", [EVEN_ASPHERE, Q_CON], ids=lambda shape: shape.name)
+def test_rays_are_taken_several_at_a_time_however_many_coefficients_there_are(shape):
+    for factory in kernels_of(shape, 40):
+        kernel = compiler._made(factory, "float64", compiler.block_signature(shapes.types.float64))
+        assert "x double>" in kernel.inspect_llvm()
 
 
 def test_kernels_on_disk_go_by_the_files_of_all_functions_within():

@@ -12,7 +12,7 @@ import inspect
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -215,7 +215,8 @@ def _read(files: KernelFiles) -> int | None:
 def _made(factory: Factory, real: str, signature: Any) -> CFunc:
     form = normalize_signature(signature)
     kernel = CFunc(factory(REALS[real]), form, locals={}, options=dict(OPTIONS))
-    kernel.compile()
+    with _unrolled() if hasattr(factory, "within") else nullcontext():
+        kernel.compile()
     # The function itself belongs to the engine of Numba, which is there for good.
     return kernel
 
@@ -272,6 +273,25 @@ def _wide_vectors() -> Iterator[None]:
         yield
     finally:
         config.CPU_FEATURES = None
+
+
+@contextmanager
+def _unrolled() -> Iterator[None]:
+    """Let LLVM unroll the loops over a shape's series, and not that over a block's 128 rays.
+
+    By itself it leaves those of more than some ten steps, and then takes rays one by one: ten times
+    as long.  Afterwards its own limits hold again.
+    """
+    _set_limits(100_000, 127)
+    try:
+        yield
+    finally:
+        _set_limits(300, 2**32 - 1)
+
+
+def _set_limits(threshold: int, steps: int) -> None:
+    binding.set_option("", f"-unroll-threshold={threshold}")
+    binding.set_option("", f"-unroll-full-max-count={steps}")
 
 
 def _none(row: Sequence[int]) -> int:

@@ -112,16 +112,14 @@ def _put_terms(
     """Give the cotangents of the coefficients, of_value·P_k + of_slope·P_k', and of the radius."""
     put(cotangents, 2, zero(q))
     p, d, p_below, d_below = zero(q) + 1.0, zero(q), zero(q) - best_fit, zero(q)
-    for group in range(length(b) // 4):
-        for j in range(4):
-            i = 4 * group + j
-            put(cotangents, 3 + i, of_value * p + of_slope * d)
-            alpha, beta, gamma = _step(number(i + 1, like), best_fit)
-            factor = fma(alpha, q, beta)
-            d_above = fma(factor, d, alpha * p - gamma * d_below)
-            p_above = fma(factor, p, -gamma * p_below)
-            p_below, d_below = p, d
-            p, d = p_above, d_above
+    for i in range(length(b)):
+        put(cotangents, 3 + i, of_value * p + of_slope * d)
+        alpha, beta, gamma = _step(number(i + 1, like), best_fit)
+        factor = fma(alpha, q, beta)
+        d_above = fma(factor, d, alpha * p - gamma * d_below)
+        p_above = fma(factor, p, -gamma * p_below)
+        p_below, d_below = p, d
+        p, d = p_above, d_above
 
 
 def q_con_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:
