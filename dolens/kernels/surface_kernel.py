@@ -11,6 +11,7 @@ from itertools import count
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.kernels.shapes import Shape
 from dolens.kernels.table import Kind
 
 _codes = count(Kind.BY_SAG)
@@ -21,8 +22,9 @@ _by_code: dict[int, "SurfaceKernel"] = {}
 class SurfaceKernel:
     """A surface has kernels for the CPU, for GPUs, or for both.
 
-    Each module offers `KERNELS`: on the CPU what `given_by_scalars` or `given_by_sag` returns, on
-    GPUs a `SagFunctions`.  Where there is none for a device, the reference in PyTorch traces there.
+    A shape of plain functions has both from these.  Otherwise each module offers `KERNELS`: on the
+    CPU what `given_by_sag` returns, on GPUs a `SagFunctions`.  Where there is none for a device,
+    the reference in PyTorch traces there.
 
     Args:
         cpu: the name of an importable module with Numba functions, or None.
@@ -31,6 +33,8 @@ class SurfaceKernel:
     Rarely needed:
         kind: a surface in closed form that the kernels' own sources name.
 
+        shape: the surface's functions, in the place of modules.
+
     Attributes:
         code: what marks this surface's steps in a table; it is given anew in each process.
     """
@@ -38,6 +42,7 @@ class SurfaceKernel:
     cpu: str | None = None
     cuda: str | None = None
     kind: Kind | None = None
+    shape: Shape | None = None
     code: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -46,12 +51,13 @@ class SurfaceKernel:
 
     def serves(self, device: str) -> bool:
         """Return whether there are kernels for `cpu` or `cuda`."""
-        return {"cpu": self.cpu, "cuda": self.cuda}.get(device) is not None
+        named = {"cpu": self.cpu, "cuda": self.cuda}.get(device) is not None
+        return named or (self.shape is not None and device in ("cpu", "cuda"))
 
 
 @cache
 def kernels_of(code: int, device: str) -> Any:
-    """Return `KERNELS` of the module for a device, imported when first needed.
+    """Return `KERNELS` of the module for a device, imported when first needed, or a shape's.
 
     Args:
         code: of a `SurfaceKernel`.
@@ -61,6 +67,8 @@ def kernels_of(code: int, device: str) -> Any:
         InputError: the module is not there, or offers no `KERNELS`.
     """
     kernel = _by_code[code]
+    if kernel.shape is not None:
+        return import_module(f"dolens.kernels.{device}.shapes").kernels(kernel.shape)
     name = {"cpu": kernel.cpu, "cuda": kernel.cuda}[device]
     try:
         module = import_module(str(name))

@@ -7,13 +7,11 @@ import torch
 
 from dolens import InputError, Rays
 from dolens.kernels.cpu.compiler import source_of
-from dolens.kernels.cpu.explicit import given_by_scalars
 from dolens.kernels.surface_kernel import SurfaceKernel, kernels_of
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.packing import unsupported
-from dolens.optics.surfaces import PackedShape
+from dolens.optics.surfaces import PackedShape, Shape
 from tests.kernels.own_surface.paraboloid import Paraboloid
-from tests.kernels.own_surface.paraboloid_cpu import paraboloid
 from tests.kernels.trace_cases import (
     LENSES,
     bundle,
@@ -60,7 +58,7 @@ def test_its_jacobian_is_that_of_the_reference(lens):
 def test_without_kernels_for_a_device_the_reference_traces(lens, monkeypatch):
     rays = bundle(lens, 3000)  # not so few that they are the reference's anyway
     expected = traced(lens, rays, "reference")
-    monkeypatch.setattr(Paraboloid, "kernel", SurfaceKernel(cuda=Paraboloid.kernel.cuda))
+    monkeypatch.setattr(Paraboloid, "kernel", SurfaceKernel(cuda="elsewhere"))
     assert unsupported(lens.system()) == "surface 2 (paraboloid) has no kernel for cpu"
     require_equal(traced(lens, rays, "auto"), expected, length=1e-15, relative=1e-15)
     with pytest.raises(InputError, match=r"surface 2 \(paraboloid\) has no kernel for cpu"):
@@ -80,29 +78,27 @@ def test_a_module_that_is_not_there_or_has_no_kernels_is_named(lens, monkeypatch
 def test_kernels_that_take_other_numbers_than_the_surface_has_are_refused(lens, monkeypatch):
     two = classmethod(lambda cls, p: PackedShape((p["curvature_x"], p["curvature_y"])))
     monkeypatch.setattr(Paraboloid, "packed", two)
-    with pytest.raises(InputError, match=r"'paraboloid' take 3 numbers of a surface; .* gives 2"):
+    with pytest.raises(InputError, match=r"'paraboloid_sag' take 3 numbers of .* gives 2"):
         lens.trace(bundle(lens, 3000))
+    monkeypatch.undo()
+    monkeypatch.setattr(Paraboloid, "numbers", classmethod(lambda cls, p: (p["twist"],)))
+    with pytest.raises(InputError, match="a layout of 3 parts, where `numbers` gives 1"):
+        Paraboloid.packed(dict(lens.surfaces["2"].named_parameters()))
 
 
-def test_kernels_on_disk_go_by_the_file_of_the_scalar_functions(tmp_path):
+def test_kernels_on_disk_go_by_the_file_of_the_shape_s_functions():
     """Not by that of the loops which they are inlined in, which all such surfaces share."""
-    functions = kernels_of(Paraboloid.kernel.code, "cpu")
-    module, name, part, digest = source_of(functions.sag)
-    assert (module, name, part) == (paraboloid.__module__, "paraboloid", "paraboloid_sag")
-    assert source_of(functions.sag_hessian)[3] == digest
+    functions = kernels_of(Paraboloid.kernel.code, "cpu").of([])
+    _, _, part, digest = source_of(functions.sag)
+    assert part == "paraboloid_sag"
     assert source_of(functions.forward)[3] != digest
-    notebook = compile_in_no_file()
+    notebook = Shape("cell", *(compile_in_no_file() for _ in range(3)), layout=())
     with pytest.raises(RuntimeError, match="in no file"):
-        source_of(given_by_scalars(notebook, numbers=1).sag)
+        source_of(kernels_of(SurfaceKernel(shape=notebook).code, "cpu").of([]).sag)
 
 
 def compile_in_no_file():
     """A function as a notebook has it."""
     scope = {}
-    exec(compile("def cell(real): ...", "<cell 1>", "exec"), scope)
+    exec(compile("def cell(p, x, y): ...", "<cell 1>", "exec"), scope)
     return scope["cell"]
-
-
-def test_a_shape_without_numbers_is_refused():
-    with pytest.raises(InputError, match="1 or more"):
-        given_by_scalars(paraboloid, numbers=0)

@@ -20,7 +20,7 @@ from dolens.optics.surfaces import (
     ZernikeFringe,
     ZernikeStandard,
 )
-from dolens.optics.surfaces.forbes import q_bfs, to_auxiliary
+from dolens.optics.surfaces.forbes import _factors, to_auxiliary
 from dolens.optics.surfaces.zernike import fringe, jacobi, noll
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.optics.exact_sags import mp, q_bfs_polynomial
@@ -195,6 +195,32 @@ def test_a_decentred_zernike_surface_is_the_same_polynomials_elsewhere():
     here = ZernikeStandard.sag_and_gradient(p | away, x + 1.5, y - 2.0)
     for a, b in zip(here[:3], ZernikeStandard.sag_and_gradient(p | at, x, y)[:3], strict=True):
         assert (a - b).abs().max() < 1e-15
+
+
+def q_bfs(q, count):
+    """Yield Q_m at q = u² and its derivative in q, for m = 0, 1, ..., count - 1.
+
+    The auxiliary polynomials are P_0 = 2, P_1 = 6 - 8q, P_(m+1) = (2 - 4q)·P_m - P_(m-1).
+    """
+    f, g, h = _factors(count)
+    zero = q * 0.0
+    here, slope, after, after_slope = zero + 2.0, zero, 6.0 - 8.0 * q, zero - 8.0
+    last = []
+    for m in range(count):
+        value, d = here, slope
+        if m > 0:
+            value, d = value - g[m - 1] * last[-1][0], d - g[m - 1] * last[-1][1]
+        if m > 1:
+            value, d = value - h[m - 2] * last[-2][0], d - h[m - 2] * last[-2][1]
+        last = [*last[-1:], (value / f[m], d / f[m])]
+        yield last[-1]
+        factor = 2.0 - 4.0 * q
+        here, slope, after, after_slope = (
+            after,
+            after_slope,
+            factor * after - here,
+            factor * after_slope - 4.0 * after - slope,
+        )
 
 
 def test_q_bfs_polynomials_are_those_that_forbes_printed():

@@ -11,12 +11,13 @@ import inspect
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from llvmlite import binding, ir
 from numba import types
 from numba.core import config, event
@@ -38,6 +39,7 @@ INTEGERS = types.CPointer(types.int64)
 REALS = {"float32": types.float32, "float64": types.float64}
 
 Factory = Callable[[types.Type], Callable[..., None]]
+Row = Sequence[int] | np.ndarray  # a step's codes
 
 _lock = threading.RLock()
 
@@ -140,7 +142,8 @@ def stamped_sources() -> list[Path]:
     limits are among them.
     """
     here = Path(__file__).parent
-    return [*sorted(here.rglob("*.py")), here.parent / "limits.py", here.parent / "table.py"]
+    above = ("limits.py", "table.py", "shapes.py")
+    return [*sorted(here.rglob("*.py")), *(here.parent / name for name in above)]
 
 
 @cache
@@ -155,17 +158,18 @@ def stamp() -> str:
 def source_of(factory: Factory) -> tuple[str, ...]:
     """Return what tells a kernel on disk from others: its name, and a digest of its own file.
 
-    A kernel that inlines a user's functions, which its factory wraps, goes by these.
+    A kernel that inlines a shape's functions, which its factory has `within`, goes by these.
 
     Raises:
         RuntimeError: they stand in no file, as in a notebook.
     """
-    function = inspect.unwrap(factory)
-    path = Path(inspect.getsourcefile(function) or "")
-    if not path.is_file():
-        raise RuntimeError(f"the source of {function.__qualname__} is in no file")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return function.__module__, function.__qualname__, factory.__name__, digest
+    digest = hashlib.sha256()
+    for one in getattr(factory, "within", (factory,)):
+        path = Path(inspect.getsourcefile(one) or "")
+        if not path.is_file():
+            raise RuntimeError(f"the source of {one.__qualname__} is in no file")
+        digest.update(path.read_bytes())
+    return factory.__module__, factory.__qualname__, factory.__name__, digest.hexdigest()
 
 
 _kernels: dict[tuple[Factory, str], int] = {}
@@ -210,7 +214,8 @@ def _read(files: KernelFiles) -> int | None:
 def _made(factory: Factory, real: str, signature: Any) -> CFunc:
     form = normalize_signature(signature)
     kernel = CFunc(factory(REALS[real]), form, locals={}, options=dict(OPTIONS))
-    kernel.compile()
+    with _unrolled() if hasattr(factory, "within") else nullcontext():
+        kernel.compile()
     # The function itself belongs to the engine of Numba, which is there for good.
     return kernel
 
@@ -269,6 +274,25 @@ def _wide_vectors() -> Iterator[None]:
         config.CPU_FEATURES = None
 
 
+@contextmanager
+def _unrolled() -> Iterator[None]:
+    """Let LLVM unroll the loops over a shape's series, and not that over a block's 128 rays.
+
+    By itself it leaves those of more than some ten steps, and then takes rays one by one: ten times
+    as long.  Afterwards its own limits hold again.
+    """
+    _set_limits(100_000, 127)
+    try:
+        yield
+    finally:
+        _set_limits(300, 2**32 - 1)
+
+
+def _set_limits(threshold: int, steps: int) -> None:
+    binding.set_option("", f"-unroll-threshold={threshold}")
+    binding.set_option("", f"-unroll-full-max-count={steps}")
+
+
 def _none(row: Sequence[int]) -> int:
     """Ask for no work rows."""
     return 0
@@ -305,6 +329,7 @@ class StepFunctions:
         parameters: cotangents of the shape's numbers from those of sag and slopes.
         starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
             starts; else it starts on the vertex plane.
+        on_asphere: `sag` and the others call those of an even asphere first, by their addresses.
         stencil: a ray depends on 4×4 neighbours among the shape's last COUNT·COLUMNS numbers only,
             and has cotangents for these alone.
         scratch: work rows of the shape's own, by its row of codes.
@@ -317,6 +342,11 @@ class StepFunctions:
     sag_hessian: Factory | None = None
     parameters: Factory | None = None
     starts_on_conic: bool = False
+    on_asphere: bool = False
     stencil: bool = False
     scratch: Callable[[Sequence[int]], int] = _none
     numbers: int | None = None
+
+    def of(self, row: Row) -> "StepFunctions":
+        """Return the functions of a step with this row of codes: these, whatever it says."""
+        return self

@@ -12,15 +12,13 @@ from typing import Any
 
 from numba import carray, njit, types
 
-from dolens.kernels.cpu.compiler import OPTIONS, shifted
-from dolens.kernels.cpu.even_asphere import (
-    COEFFICIENTS,
-    even_asphere_hessian,
-    even_asphere_parameters,
-    even_asphere_sag,
-)
+from dolens.kernels.cpu.compiler import OPTIONS, call_block, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
+    ASPHERE_HESSIAN,
+    ASPHERE_PARAMETERS,
+    ASPHERE_SAG,
+    BEHIND_ASPHERE,
     BLOCK,
     CODE_ROW,
     COLUMNS,
@@ -105,14 +103,13 @@ def _cells(real: types.Type) -> tuple[Any, Any, Any]:
 
 def grid_sag(real: types.Type) -> Callable[..., None]:
     """Add the grid to the rows of sag and slopes; the margin is positive on the grid too."""
-    even = njit(**OPTIONS)(even_asphere_sag(real))
     fetch, basis, _ = _cells(real)
     zero, half = real(0.0), real(0.5)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        even(before, after, cotangents, record, work, codes)
         w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
-        own = carray(shifted(record, COEFFICIENTS + q[COUNT]), UNBOUNDED)
+        call_block(q[ASPHERE_SAG], before, after, cotangents, record, work, codes)
+        own = carray(shifted(record, BEHIND_ASPHERE + q[COUNT]), UNBOUNDED)
         fetch(w, own, q[COLUMNS], q[DEGREE])
         half_x = half * real(q[COLUMNS] - 1) * own[0]
         half_y = half * real(q[DEGREE] - 1) * own[1]
@@ -146,14 +143,13 @@ def grid_sag(real: types.Type) -> Callable[..., None]:
 
 def grid_hessian(real: types.Type) -> Callable[..., None]:
     """Add the grid to the rows of slopes and second derivatives."""
-    even = njit(**OPTIONS)(even_asphere_hessian(real))
     fetch, basis, second_derivatives = _cells(real)
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        even(before, after, cotangents, record, work, codes)
         w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
-        own = carray(shifted(record, COEFFICIENTS + q[COUNT]), UNBOUNDED)
+        call_block(q[ASPHERE_HESSIAN], before, after, cotangents, record, work, codes)
+        own = carray(shifted(record, BEHIND_ASPHERE + q[COUNT]), UNBOUNDED)
         fetch(w, own, q[COLUMNS], q[DEGREE])
         for i in range(BLOCK):
             bx = basis(w[PLACE_X + i], own[0])
@@ -188,7 +184,12 @@ def grid_hessian(real: types.Type) -> Callable[..., None]:
 
 def grid_parameters(real: types.Type) -> Callable[..., None]:
     """Fill the cotangents of the even asphere's numbers: the grid is data."""
-    return even_asphere_parameters(real)
+
+    def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
+        q = carray(codes, CODE_ROW)
+        call_block(q[ASPHERE_PARAMETERS], before, after, cotangents, record, work, codes)
+
+    return kernel
 
 
 def _rows(row: Sequence[int]) -> int:
@@ -196,4 +197,6 @@ def _rows(row: Sequence[int]) -> int:
     return ROWS
 
 
-KERNELS = given_by_sag(grid_sag, grid_hessian, grid_parameters, starts_on_conic=True, scratch=_rows)
+KERNELS = given_by_sag(
+    grid_sag, grid_hessian, grid_parameters, starts_on_conic=True, scratch=_rows, on_asphere=True
+)

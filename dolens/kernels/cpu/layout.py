@@ -77,6 +77,8 @@ TURN_XX, TURN_XY, TURN_XZ, TURN_YX, TURN_YY, TURN_YZ, TURN_ZX, TURN_ZY, TURN_ZZ 
 )
 POSE = 12  # numbers of a change of axes: its step and its turn
 SHAPE = Slot.HEADER  # the first number of a shape
+# Behind c, k and a2: the even coefficients, and what other shapes add; and their cotangents.
+BEHIND_ASPHERE, OF_BEHIND_ASPHERE = SHAPE + 3, OF_SHAPE + 3 * BLOCK
 SHORT_RECORD = 32  # as many numbers as any kernel reads by name
 
 KIND, OFFSET, LENGTH = Code.KIND, Code.OFFSET, Code.LENGTH
@@ -92,7 +94,9 @@ FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS, EXTRAS_ADDRESS = rang
 STARTS_ON_CONIC, STENCIL = Code.ROW + 6, Code.ROW + 7
 # Block functions of a phase.
 PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 8, Code.ROW + 11)
-CODE_ROW = Code.ROW + 11
+# Those of the even asphere that other shapes add to.
+ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 11, Code.ROW + 14)
+CODE_ROW = Code.ROW + 14
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 CIRCLE, RECTANGLE, ELLIPSE = int(Outline.CIRCLE), int(Outline.RECTANGLE), int(Outline.ELLIPSE)

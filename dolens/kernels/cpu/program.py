@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.cpu import compiler, even_asphere, jobs
+from dolens.kernels.cpu import compiler, jobs, shapes
 from dolens.kernels.cpu.arithmetic import phase_adjoint, phase_forward
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
@@ -21,9 +21,12 @@ from dolens.kernels.cpu.axes import (
     lens_axes_forward,
     sensor_forward,
 )
-from dolens.kernels.cpu.compiler import LawFunctions, StepFunctions
+from dolens.kernels.cpu.compiler import LawFunctions, Row, StepFunctions
 from dolens.kernels.cpu.layout import (
     ADJOINT,
+    ASPHERE_HESSIAN,
+    ASPHERE_PARAMETERS,
+    ASPHERE_SAG,
     BLOCK,
     CODE_ROW,
     COTANGENT_HEADER,
@@ -43,6 +46,7 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.plane import clip, plane_adjoint
 from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
+from dolens.kernels.shapes import shape_named
 from dolens.kernels.surface_kernel import kernels_of, law_kernels_of
 from dolens.kernels.table import OUTPUT_ROWS, Code, Kind, Outline, Slot, SurfaceTable, VariableMap
 
@@ -58,9 +62,15 @@ _STEPS = {
 }
 
 
-def functions_of(code: int) -> StepFunctions:
-    """Return the functions of a step with this code; a surface's module is imported for them."""
-    return _STEPS[Kind(code)] if code in _STEPS else kernels_of(code, "cpu")
+def functions_of(row: Row, place: int = Code.KIND) -> StepFunctions:
+    """Return the functions of a step by its row of codes; a surface's module is imported for them.
+
+    Args:
+        row: of the step.
+        place: `Code.BASE` for the surface that a deflection stands on.
+    """
+    code = int(row[place])
+    return _STEPS[Kind(code)] if code in _STEPS else kernels_of(code, "cpu").of(row)
 
 
 class Steps(NamedTuple):
@@ -91,26 +101,20 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
             _compile_law(row, real, derivatives)
             longest = max(longest, int(row[Code.LENGTH]))
             continue
-        functions = functions_of(int(row[Code.KIND]))
+        functions = functions_of(row)
         numbers = int(row[Code.LENGTH]) - Slot.HEADER
         if functions.numbers not in (None, numbers):
             kernel = functions.sag or functions.forward
             raise InputError(
-                f"the CPU kernels '{kernel.__qualname__}' take {functions.numbers} numbers of a "
+                f"the CPU kernels '{kernel.__name__}' take {functions.numbers} numbers of a "
                 f"surface; its `packed` gives {numbers}"
             )
         row[FORWARD] = compiler.compile_block(functions.forward, real)
         if functions.sag is not None:
-            row[SAG_AND_SLOPES] = compiler.compile_block(functions.sag, real)
+            _compile_sag(row, functions, real, derivatives)
             row[STARTS_ON_CONIC], row[STENCIL] = functions.starts_on_conic, functions.stencil
         if derivatives:
             row[ADJOINT] = compiler.compile_block(functions.adjoint, real)
-            for place, function in (
-                (SAG_HESSIAN, functions.sag_hessian),
-                (PARAMETERS, functions.parameters),
-            ):
-                if function is not None:
-                    row[place] = compiler.compile_block(function, real)
         length = Slot.HEADER + STENCIL_NUMBERS if functions.stencil else int(row[Code.LENGTH])
         longest = max(longest, length)
         scratch = max(scratch, functions.scratch(row))
@@ -179,13 +183,26 @@ def frame_of(table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: 
     return _frame(key, extras.data_ptr(), outputs, columns, values.itemsize)
 
 
+def _compile_sag(row: np.ndarray, functions: StepFunctions, real: str, derivatives: bool) -> None:
+    """Compile what a surface that is given by its sag needs."""
+    parts = [(functions, (SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS))]
+    if functions.on_asphere:
+        asphere = shapes.kernels(shape_named("even_asphere")).of(row)
+        parts.append((asphere, (ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS)))
+    for own, places in parts:
+        three = (own.sag, own.sag_hessian, own.parameters)
+        for place, function in zip(places, three if derivatives else three[:1], strict=False):
+            if function is not None:
+                row[place] = compiler.compile_block(function, real)
+
+
 def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
     """Compile a deflection's law, and for a phase the sag of the surface that it stands on."""
     law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
-    base = functions_of(int(row[Code.BASE]))
+    base = functions_of(row, Code.BASE)
     if base.sag is None:
         # Planes, spheres and conics are aspheres without coefficients: c, k and a2 = 0.
-        base = even_asphere.KERNELS
+        base = shapes.kernels(shape_named("even_asphere")).of(row)
     always = [(FORWARD, law.forward), (PHASE_AND_SLOPES, law.phase)]
     for_adjoint = [
         (ADJOINT, law.adjoint),
@@ -193,8 +210,7 @@ def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
         (PHASE_PARAMETERS, law.phase_parameters),
     ]
     if law.phase is not None:
-        always.append((SAG_AND_SLOPES, base.sag))
-        for_adjoint += [(SAG_HESSIAN, base.sag_hessian), (PARAMETERS, base.parameters)]
+        _compile_sag(row, base, real, derivatives)
     for place, function in always + (for_adjoint if derivatives else []):
         if function is not None:
             row[place] = compiler.compile_block(function, real)
@@ -383,9 +399,7 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
     steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
     rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
     first_step = int(steps.min(initial=codes.shape[0]))
-    stencils = np.array(
-        [functions_of(int(code)).stencil for code in codes[:, Code.KIND]], dtype=bool
-    )
+    stencils = np.array([functions_of(row).stencil for row in codes], dtype=bool)
     local = stencils[steps] & (rows >= COTANGENT_HEADER + Slot.HEADER)
     spline = None
     if local.any():

@@ -13,23 +13,21 @@ from typing import Any
 from numba import carray, njit, types
 
 from dolens.kernels.cpu import jacobi as polynomials
-from dolens.kernels.cpu.compiler import OPTIONS, int64_at, shifted
-from dolens.kernels.cpu.even_asphere import (
-    COEFFICIENTS,
-    OF_COEFFICIENTS,
-    even_asphere_hessian,
-    even_asphere_parameters,
-    even_asphere_sag,
-)
+from dolens.kernels.cpu.compiler import OPTIONS, call_block, int64_at, shifted
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.jacobi import jacobi
 from dolens.kernels.cpu.layout import (
+    ASPHERE_HESSIAN,
+    ASPHERE_PARAMETERS,
+    ASPHERE_SAG,
+    BEHIND_ASPHERE,
     BLOCK,
     CODE_ROW,
     COUNT,
     DEGREE,
     EXTRAS_ADDRESS,
     FURTHER,
+    OF_BEHIND_ASPHERE,
     OF_SAG,
     OF_SLOPE_X,
     OF_SLOPE_Y,
@@ -119,15 +117,14 @@ def _parts(real: types.Type) -> tuple[Any, Any, Any, Any]:
 
 def zernike_sag(real: types.Type) -> Callable[..., None]:
     """Add the polynomials to the rows of sag and slopes."""
-    even = njit(**OPTIONS)(even_asphere_sag(real))
     begin, next_order, sums, _ = _parts(real)
     two = real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        even(before, after, cotangents, record, work, codes)
         w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(q[ASPHERE_SAG], before, after, cotangents, record, work, codes)
         extras = carray(int64_at(q[EXTRAS_ADDRESS]), UNBOUNDED)
-        own = carray(shifted(record, COEFFICIENTS + q[COUNT]), UNBOUNDED)
+        own = carray(shifted(record, BEHIND_ASPHERE + q[COUNT]), UNBOUNDED)
         scale = begin(w, own)
         place = 1
         for m in range(q[DEGREE] + 1):
@@ -156,15 +153,14 @@ def zernike_hessian(real: types.Type) -> Callable[..., None]:
     With E = C·A + S·B, and G1 and G2 the same with w^(m-1) and w^(m-2):
     s_uu = m(m-1)·G2 + 4u·m·G1' + 2E' + 4u²·E''.
     """
-    even = njit(**OPTIONS)(even_asphere_hessian(real))
     begin, next_order, sums, _ = _parts(real)
     two, four = real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        even(before, after, cotangents, record, work, codes)
         w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(q[ASPHERE_HESSIAN], before, after, cotangents, record, work, codes)
         extras = carray(int64_at(q[EXTRAS_ADDRESS]), UNBOUNDED)
-        own = carray(shifted(record, COEFFICIENTS + q[COUNT]), UNBOUNDED)
+        own = carray(shifted(record, BEHIND_ASPHERE + q[COUNT]), UNBOUNDED)
         scale = begin(w, own)
         squared = scale * scale
         place = 1
@@ -199,7 +195,6 @@ def zernike_parameters(real: types.Type) -> Callable[..., None]:
 
     Of Re(w^m)·P(q): of_sag·C·P + of_u·(m·C_1·P + 2u·C·P') + of_v·(-m·S_1·P + 2v·C·P').
     """
-    even = njit(**OPTIONS)(even_asphere_parameters(real))
     begin, next_order, _, norm = _parts(real)
     recurrence, begin_polynomials, advance = jacobi(real)
     zero, two = real(0.0), real(2.0)
@@ -212,11 +207,11 @@ def zernike_parameters(real: types.Type) -> Callable[..., None]:
             row[i] = factor * (w[of_value + i] * value + w[of_slope + i] * slope)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        even(before, after, cotangents, record, work, codes)
         w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        call_block(q[ASPHERE_PARAMETERS], before, after, cotangents, record, work, codes)
         extras = carray(int64_at(q[EXTRAS_ADDRESS]), UNBOUNDED)
-        own = carray(shifted(record, COEFFICIENTS + q[COUNT]), UNBOUNDED)
-        out = shifted(cotangents, OF_COEFFICIENTS + BLOCK * q[COUNT])
+        own = carray(shifted(record, BEHIND_ASPHERE + q[COUNT]), UNBOUNDED)
+        out = shifted(cotangents, OF_BEHIND_ASPHERE + BLOCK * q[COUNT])
         constants = carray(out, CONSTANTS * BLOCK)
         for i in range(CONSTANTS * BLOCK):
             constants[i] = zero
@@ -259,5 +254,10 @@ def _rows(row: Sequence[int]) -> int:
 
 
 KERNELS = given_by_sag(
-    zernike_sag, zernike_hessian, zernike_parameters, starts_on_conic=True, scratch=_rows
+    zernike_sag,
+    zernike_hessian,
+    zernike_parameters,
+    starts_on_conic=True,
+    on_asphere=True,
+    scratch=_rows,
 )

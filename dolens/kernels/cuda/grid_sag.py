@@ -8,13 +8,13 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide
-from dolens.kernels.cuda.even_asphere import (
+from dolens.kernels.cuda.functions import SagFunctions
+from dolens.kernels.cuda.layout import COLUMNS, COUNT, DEGREE, SHAPE
+from dolens.kernels.cuda.shapes import (
     even_asphere_hessian,
     even_asphere_sag,
     even_asphere_sums,
 )
-from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.layout import COLUMNS, COUNT, DEGREE, SHAPE
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # where there are no even coefficients but a2
 NODES = tl.constexpr(4)

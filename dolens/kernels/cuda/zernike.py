@@ -9,14 +9,14 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
-from dolens.kernels.cuda.even_asphere import (
+from dolens.kernels.cuda.functions import SagFunctions
+from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
+from dolens.kernels.cuda.layout import COUNT, DEGREE, EXTRAS, SHAPE
+from dolens.kernels.cuda.shapes import (
     even_asphere_hessian,
     even_asphere_sag,
     even_asphere_sums,
 )
-from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
-from dolens.kernels.cuda.layout import COUNT, DEGREE, EXTRAS, SHAPE
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # where there are no even coefficients but a2
 CONSTANTS = tl.constexpr(3)  # normalisation radius and decentre, before the coefficients

@@ -1,6 +1,7 @@
 """A surface shape has a file here, and registers itself under the `type` of a prescription."""
 
 from dolens.kernels.limits import GRAZING
+from dolens.kernels.shapes import Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.base import PackedShape, Surface
@@ -43,6 +44,7 @@ __all__ = [
     "QBfs",
     "QCon",
     "RadialPhase",
+    "Shape",
     "Sphere",
     "Surface",
     "SurfaceKernel",

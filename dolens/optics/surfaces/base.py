@@ -7,7 +7,7 @@ reaches; their gradient is cut off where the trace ends.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -15,7 +15,9 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
+from dolens.kernels.shapes import Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.kernels.table import Code
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
@@ -70,6 +72,33 @@ class PackedShape(NamedTuple):
     data: int = 0
 
 
+def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -> PackedShape:
+    """Return the numbers of a shape of plain functions for its kernels.
+
+    Args:
+        layout: of its `Shape`.
+        parts: what its functions take; a number that is no tensor is zero.
+        more: further fields of `PackedShape`.
+
+    A series is filled up to a multiple of four, and its length stands where the layout says.
+
+    Raises:
+        InputError: more or fewer parts than the layout has.
+    """
+    if len(layout) != len(parts):
+        raise InputError(f"a layout of {len(layout)} parts, where `numbers` gives {len(parts)}")
+    fields = {Code.COUNT: "count", Code.COLUMNS: "columns", Code.DEGREE: "degree"}
+    numbers: list[Any] = []
+    for place, part in zip(layout, parts, strict=True):
+        if place is None:
+            numbers.append(part)
+        else:
+            numbers += (*part, *(-len(part) % 4) * (0.0,))
+            more[fields[place]] = len(part) + -len(part) % 4
+    tensors = (number if isinstance(number, Tensor) else None for number in numbers)
+    return PackedShape(tuple(tensors), **more)
+
+
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
     """Return a new tensor of a number, nested lists of numbers, or an array.
 
@@ -90,8 +119,8 @@ class Surface(nn.Module):
     a mapping, so that a trace can be given other values than the stored ones (scaled variables of
     an optimizer, a batch of perturbed lenses) without touching any state.
 
-    A new shape is a subclass with `kind`, `parameter_names`, `sag_and_gradient`, and a better
-    `start` where there is one; Newton's iteration does the rest.  A shape with a closed form
+    A new shape is a subclass with `kind`, `parameter_names`, `sag_and_gradient` or a `shape`, and a
+    better `start` where there is one; Newton's iteration does the rest.  A shape with a closed form
     overrides `intersect` and `normal`.  `register_surface` makes it known to prescriptions.
 
     Args:
@@ -106,7 +135,10 @@ class Surface(nn.Module):
         optional: names that a prescription may leave out; every other is then zero.
         curvatures: names of which a prescription may give the radius instead: `radius` for
             `curvature`, `radius_x` for `curvature_x`.
-        kernel: where its fast kernels are; None: it has none, and the reference traces.
+        shape: the sag and its derivatives, in functions that the kernels share with the reference;
+            a subclass inherits them, but no kernels.
+        kernel: where its fast kernels are, those of its own `shape` if nothing is said; None: it
+            has none, and the reference traces.
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
@@ -117,6 +149,7 @@ class Surface(nn.Module):
     """
 
     kind: ClassVar[str] = ""
+    shape: ClassVar[Shape | None] = None
     kernel: ClassVar[SurfaceKernel | None] = None
     constants: ClassVar[tuple[str, ...]] = ()
     arrays: ClassVar[tuple[str, ...]] = ()
@@ -130,7 +163,8 @@ class Surface(nn.Module):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        cls.kernel = cls.__dict__.get("kernel")
+        shape: Shape | None = cls.__dict__.get("shape")
+        cls.kernel = cls.__dict__.get("kernel", shape and SurfaceKernel(shape=shape))
         cls.rotational = cls.__dict__.get("rotational", False)
         cls.closed_form = cls.__dict__.get("closed_form", False)
 
@@ -188,17 +222,33 @@ class Surface(nn.Module):
         Returns:
             sag (mm), ∂sag/∂x, ∂sag/∂y, and a margin that is positive where the sag branch exists
             (None: everywhere).  Where it does not, the numbers are finite.
+
+        Here: those of `shape`.
         """
-        raise NotImplementedError
+        if cls.shape is None:
+            raise NotImplementedError
+        sag, sx, sy, exists = cls.shape.sag(cls.numbers(p), x, y)
+        return sag, sx, sy, exists.detach() if isinstance(exists, Tensor) else None
+
+    @classmethod
+    def numbers(cls, p: Parameters) -> tuple[Any, ...]:
+        """Return what the functions of `shape` take: numbers, and series of them; 0.0 is none.
+
+        Here: all parameters in the order of `parameter_names`, and then the constants.
+        """
+        return tuple(p.values())
 
     @classmethod
     @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return the numbers that `kernel` takes, in its order.
 
-        Here: all parameters in the order of `parameter_names`, and then the constants.
+        Here: `numbers`, with series filled up to a multiple of four.
         """
-        return PackedShape(tuple(p.values()))
+        numbers = cls.numbers(p)
+        if cls.shape is None:
+            return PackedShape(numbers)
+        return packed_as(cls.shape.layout, numbers)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

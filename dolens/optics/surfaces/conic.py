@@ -8,18 +8,19 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING, TINY
+from dolens.kernels.operations import Number, divide, safe_sqrt
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
-from dolens.optics.surfaces.refraction import PlaneRay, safe_sqrt
+from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
 
 _FLAT = 1e-15  # 1/mm
 
 
-def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sag of a conic, s = c·r²/(1 + √(1 - (1+k)c²r²)).
+def conic_sag(c: Number, k: Number, r2: Number) -> tuple[Number, Number, Number]:
+    """Return the sag of a conic, s = c·r²/(1 + R) with R = √(1 - (1+k)c²r²).
 
     Args:
         c: curvature, 1/mm.
@@ -27,12 +28,38 @@ def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor,
         r2: x² + y², mm².
 
     Returns:
-        sag (mm), ds/d(r²) = c/(2√(1 - (1+k)c²r²)) (1/mm), and a margin that is positive where
-        the branch exists.
+        sag (mm), ds/d(r²) = c/2R (1/mm), and R² as a margin that is positive where the branch
+        exists.
     """
-    discriminant = 1.0 - ((1.0 + k) * c * c) * r2
-    root = safe_sqrt(discriminant)
-    return c * r2 / (1.0 + root), 0.5 * c / root, discriminant.detach()
+    squared = 1.0 - ((1.0 + k) * c * c) * r2
+    root = safe_sqrt(squared)
+    return divide(c * r2, 1.0 + root), divide(0.5 * c, root), squared
+
+
+def conic_slopes(c: Number, k: Number, r2: Number) -> tuple[Number, Number]:
+    """Return ds/d(r²) of a conic (1/mm), and the second derivative in r² (1/mm³)."""
+    ec2 = (1.0 + k) * c * c
+    root = safe_sqrt(1.0 - ec2 * r2)
+    slope = divide(0.5 * c, root)
+    return slope, divide(0.5 * slope * ec2, root * root)
+
+
+def conic_cotangents(
+    c: Number, k: Number, r2: Number, of_sag: Number, of_slope: Number
+) -> tuple[Number, Number]:
+    """Return the cotangents of c and k from those of a conic's sag and of ds/d(r²).
+
+    s_c = (r² + (1+k)s²)/2R and s_k = c·s²/2R; of c/2R: 1/2R³ and c³r²/4R³.
+    """
+    e = 1.0 + k
+    root = safe_sqrt(1.0 - e * c * c * r2)
+    inverse = divide(1.0, root)
+    sag = divide(c * r2, 1.0 + root)
+    cubed = 0.5 * of_slope * inverse * inverse * inverse
+    return (
+        0.5 * of_sag * inverse * (r2 + e * sag * sag) + cubed,
+        0.5 * c * (of_sag * inverse * sag * sag + c * c * r2 * cubed),
+    )
 
 
 def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[Tensor, Tensor]:
@@ -125,7 +152,7 @@ class Conic(Surface):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Return sag (S1) and slopes (S4): ∂s/∂x = 2x·ds/d(r²)."""
         sag, slope, exists = conic_sag(p["curvature"], cls.conic_constant(p), x * x + y * y)
-        return sag, 2.0 * x * slope, 2.0 * y * slope, exists
+        return sag, 2.0 * x * slope, 2.0 * y * slope, exists.detach()
 
     @classmethod
     def intersect(

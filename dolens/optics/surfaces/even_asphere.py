@@ -1,14 +1,34 @@
 """An even asphere is a conic plus powers of r² (S1, S2); other shapes add further terms to it."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.kernels.operations import (
+    Number,
+    by_radius,
+    divide,
+    fma,
+    horner,
+    horner_second,
+    length,
+    put,
+    put_powers,
+    safe_sqrt,
+)
+from dolens.kernels.shapes import Shape
+from dolens.kernels.table import Code
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
-from dolens.optics.surfaces.conic import Conic, check_reach, conic_distance, conic_sag
+from dolens.optics.surfaces.conic import (
+    Conic,
+    check_reach,
+    conic_cotangents,
+    conic_distance,
+    conic_slopes,
+)
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
 
@@ -26,6 +46,58 @@ def even_power(name: str) -> int | None:
     return None if power is None or power % 2 else power
 
 
+def even_asphere_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:
+    """Return sag and slopes, and the margin of the conic's branch.
+
+    With q = r² and H = a4 + a6·q + ...: s = conic + a2·q + q²·H.
+    """
+    c, k, a2, a = p
+    q = fma(x, x, y * y)
+    h, d = horner(a, q)
+    squared = 1.0 - ((1.0 + k) * c * c) * q
+    root = safe_sqrt(squared)
+    beyond = 1.0 + root
+    both = divide(c, root * beyond)
+    twice = fma(both, beyond, 2.0 * fma(q, fma(q, d, 2.0 * h), a2))
+    return q * fma(both, root, fma(q, h, a2)), x * twice, y * twice, squared
+
+
+def even_asphere_hessian(
+    p: Any, x: Number, y: Number
+) -> tuple[Number, Number, Number, Number, Number]:
+    """Return slopes and second derivatives."""
+    c, k, a2, a = p
+    q = fma(x, x, y * y)
+    h, d, e = horner_second(a, q)
+    slope, second = conic_slopes(c, k, q)
+    slope = slope + a2 + q * (2.0 * h + q * d)
+    return by_radius(x, y, slope, second + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e)
+
+
+def even_asphere_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_sag: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of c, k, a2 and the further coefficients."""
+    c, k, _, a = p
+    q = fma(x, x, y * y)
+    of_slope = 2.0 * (of_x * x + of_y * y)
+    of_c, of_k = conic_cotangents(c, k, q, of_sag, of_slope)
+    put(cotangents, 0, of_c)
+    put(cotangents, 1, of_k)
+    put(cotangents, 2, of_sag * q + of_slope)
+    put_powers(cotangents, 3, length(a), q, q, of_sag, of_slope, 2, 1)
+
+
+EVEN_ASPHERE = Shape(
+    "even_asphere",
+    even_asphere_sag,
+    even_asphere_hessian,
+    even_asphere_parameters,
+    layout=(None, None, None, Code.COUNT),
+    starts_on_conic=True,
+)
+
+
 @register_surface
 class EvenAsphere(Conic):
     """The sag is s(r) = conic + a2·r² + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power).
@@ -35,7 +107,7 @@ class EvenAsphere(Conic):
     """
 
     kind = "even_asphere"
-    kernel = SurfaceKernel("dolens.kernels.cpu.even_asphere", "dolens.kernels.cuda.even_asphere")
+    shape = EVEN_ASPHERE
     rotational = True
 
     @classmethod
@@ -52,32 +124,24 @@ class EvenAsphere(Conic):
         return ["curvature", "conic", *(f"a{power}" for power in sorted(powers))]
 
     @classmethod
+    def numbers(cls, p: Parameters) -> tuple[Any, ...]:
+        """Return c, k, a2, and a4, a6, ... up to the highest."""
+        highest = max((power for name in p if (power := even_power(name))), default=2)
+        further = tuple(p.get(f"a{power}", 0.0) for power in range(4, highest + 1, 2))
+        return p["curvature"], p["conic"], p.get("a2", 0.0), further
+
+    @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Return sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
-        r2 = torch.addcmul(x * x, y, y)
-        sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
-        powers = sorted(power // 2 for name in p if (power := even_power(name)))
-        if powers:
-            # Horner for Q = Σ a_2i·r^(2i-2) and Q', the derivative in r²; the sag adds r²·Q.
-            q, dq = torch.zeros_like(r2), torch.zeros_like(r2)
-            for power in range(powers[-1], 0, -1):
-                dq = torch.addcmul(q, dq, r2)
-                q = q * r2 if power not in powers else torch.addcmul(p[f"a{2 * power}"], q, r2)
-            sag = torch.addcmul(sag, q, r2)
-            slope = slope + torch.addcmul(q, dq, r2)
-        return sag, 2.0 * x * slope, 2.0 * y * slope, exists
+        return super(Conic, cls).sag_and_gradient(p, x, y)
 
     @classmethod
     @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c, k, a2, and a4, a6, ...: all powers up to the highest, in groups of four."""
-        powers = [power for name in p if (power := even_power(name))]
-        count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
-        coefficients = [p.get(f"a{2 * i + 4}") for i in range(count)]
-        numbers = (p["curvature"], p["conic"], p.get("a2"), *coefficients)
-        return PackedShape(numbers, count=count)
+        return super(Conic, cls).packed(p)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

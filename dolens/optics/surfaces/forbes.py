@@ -7,7 +7,7 @@ Opt. Express 18, 19700 (2010).
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -15,18 +15,234 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
+from dolens.kernels.operations import (
+    Number,
+    Series,
+    by_radius,
+    divide,
+    fma,
+    length,
+    number,
+    put,
+    sqrt,
+    term,
+    where,
+    zero,
+)
+from dolens.kernels.shapes import Shape
+from dolens.kernels.table import Code
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.surfaces.conic import check_reach, conic_distance, conic_sag
+from dolens.optics.surfaces.conic import (
+    check_reach,
+    conic_cotangents,
+    conic_distance,
+    conic_sag,
+    conic_slopes,
+)
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
-from dolens.optics.surfaces.zernike import jacobi, require_normalization_radius
+from dolens.optics.surfaces.zernike import require_normalization_radius
 
 _TERM = order_pattern("q", 0)
-_KERNELS = ("dolens.kernels.cpu.forbes", "dolens.kernels.cuda.forbes")
 # The square of the smallest cosine that the departure along the normal is divided by.
-_STEEPEST = 1e-12
+STEEPEST = 1e-12
+
+
+def _step(k: Number, best_fit: Number) -> tuple[Number, Number, Number]:
+    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), beginning with P_0 = 1.
+
+    Those of Q_con (`best_fit` is 0.0) are Jacobi polynomials P_k^(0, 4)(2q - 1), see
+    `dolens.optics.surfaces.zernike`; the auxiliary ones of Q_bfs (1.0) have P_(-1) = -1.
+    """
+    fits = best_fit > 0.0
+    inverse = divide(1.0, 4.0 * k * (k + 4.0) * (k + 1.0))
+    here, both = 2.0 * k + 3.0, 2.0 * k + 4.0
+    slope = here * both * (2.0 * k + 2.0) * inverse
+    gamma = 2.0 * (k - 1.0) * (k + 3.0) * both * inverse
+    return (
+        where(fits, -4.0, 2.0 * slope),
+        where(fits, 2.0, -16.0 * here * inverse - slope),
+        where(fits, 1.0, gamma),
+    )
+
+
+def _total(b: Series, q: Number, like: Number, best_fit: Number) -> tuple[Number, Number]:
+    """Return T = Σ b_k·P_k(q) and T'; `like` is a number of the surface's."""
+    t, t1 = zero(q), zero(q)
+    p, d, p_below, d_below = zero(q) + 1.0, zero(q), zero(q) - best_fit, zero(q)
+    for i in range(length(b)):
+        t = fma(term(b, i), p, t)
+        t1 = fma(term(b, i), d, t1)
+        alpha, beta, gamma = _step(number(i + 1, like), best_fit)
+        factor = fma(alpha, q, beta)
+        d_above = fma(factor, d, alpha * p - gamma * d_below)
+        p_above = fma(factor, p, -gamma * p_below)
+        p_below, d_below = p, d
+        p, d = p_above, d_above
+    return t, t1
+
+
+def _total_second(
+    b: Series, q: Number, like: Number, best_fit: Number
+) -> tuple[Number, Number, Number]:
+    """Return T, T' and T''; see `_total`."""
+    t, t1, t2 = zero(q), zero(q), zero(q)
+    p, d, e = zero(q) + 1.0, zero(q), zero(q)
+    p_below, d_below, e_below = zero(q) - best_fit, zero(q), zero(q)
+    for i in range(length(b)):
+        t = fma(term(b, i), p, t)
+        t1 = fma(term(b, i), d, t1)
+        t2 = fma(term(b, i), e, t2)
+        alpha, beta, gamma = _step(number(i + 1, like), best_fit)
+        factor = fma(alpha, q, beta)
+        e_above = fma(factor, e, 2.0 * alpha * d - gamma * e_below)
+        d_above = fma(factor, d, alpha * p - gamma * d_below)
+        p_above = fma(factor, p, -gamma * p_below)
+        p_below, d_below, e_below = p, d, e
+        p, d, e = p_above, d_above, e_above
+    return t, t1, t2
+
+
+def _put_terms(
+    cotangents: Any, b: Series, q: Number, like: Number, best_fit: Number,
+    of_value: Number, of_slope: Number,
+) -> None:  # fmt: skip
+    """Give the cotangents of the coefficients, of_value·P_k + of_slope·P_k', and of the radius."""
+    put(cotangents, 2, zero(q))
+    p, d, p_below, d_below = zero(q) + 1.0, zero(q), zero(q) - best_fit, zero(q)
+    for i in range(length(b)):
+        put(cotangents, 3 + i, of_value * p + of_slope * d)
+        alpha, beta, gamma = _step(number(i + 1, like), best_fit)
+        factor = fma(alpha, q, beta)
+        d_above = fma(factor, d, alpha * p - gamma * d_below)
+        p_above = fma(factor, p, -gamma * p_below)
+        p_below, d_below = p, d
+        p, d = p_above, d_above
+
+
+def q_con_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:
+    """Return sag and slopes, and the margin of the conic's branch."""
+    c, k, radius, b = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    sag, slope, margin = conic_sag(c, k, r2)
+    q = r2 * scale
+    t, t1 = _total(b, q, c, 0.0)
+    slope = 2.0 * fma(scale * q, fma(q, t1, 2.0 * t), slope)
+    return fma(q * q, t, sag), x * slope, y * slope, margin
+
+
+def q_con_hessian(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number, Number]:
+    """Return slopes and second derivatives."""
+    c, k, radius, b = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    slope, second = conic_slopes(c, k, r2)
+    q = r2 * scale
+    t, t1, t2 = _total_second(b, q, c, 0.0)
+    slope = slope + scale * q * (2.0 * t + q * t1)
+    return by_radius(x, y, slope, second + scale * scale * (2.0 * t + q * (4.0 * t1 + q * t2)))
+
+
+def q_con_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_sag: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of c, k and the coefficients."""
+    c, k, radius, b = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    of_slope = 2.0 * (of_x * x + of_y * y)
+    of_c, of_k = conic_cotangents(c, k, r2, of_sag, of_slope)
+    put(cotangents, 0, of_c)
+    put(cotangents, 1, of_k)
+    q = r2 * scale
+    along = of_slope * scale
+    _put_terms(cotangents, b, q, c, 0.0, q * (of_sag * q + 2.0 * along), along * q * q)
+
+
+def _secant(c: Number, k: Number, r2: Number) -> tuple[Number, Number, Number, Number]:
+    """Return a = 1 - k·c²r², b = a - c²r², which is held beyond the branch, σ = √(a/b), and 1/ab.
+
+    Then dσ/d(r²) = σ·c²/(2ab).
+    """
+    turned = c * c * r2
+    left = 1.0 - (1.0 + k) * turned
+    b = where(left > STEEPEST, left, STEEPEST)
+    a = b + turned
+    return a, b, sqrt(divide(a, b)), divide(1.0, a * b)
+
+
+def q_bfs_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:
+    """Return sag and slopes, and the margin of the conic's branch.
+
+    The departure is σ·E with E = q·(1 - q)·T.
+    """
+    c, k, radius, terms = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    sag, slope, margin = conic_sag(c, k, r2)
+    q = r2 * scale
+    t, t1 = _total(terms, q, c, 1.0)
+    _, _, secant, inverse = _secant(c, k, r2)
+    weight = q * (1.0 - q)
+    e, e1 = weight * t, scale * fma(weight, t1, (1.0 - 2.0 * q) * t)
+    slope = 2.0 * fma(secant, fma(0.5 * c * c * inverse, e, e1), slope)
+    return fma(secant, e, sag), x * slope, y * slope, margin - STEEPEST
+
+
+def q_bfs_hessian(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number, Number]:
+    """Return slopes and second derivatives."""
+    c, k, radius, terms = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    slope, second = conic_slopes(c, k, r2)
+    q = r2 * scale
+    t, t1, t2 = _total_second(terms, q, c, 1.0)
+    a, b, secant, inverse = _secant(c, k, r2)
+    weight, turn = q * (1.0 - q), 1.0 - 2.0 * q
+    e, e1 = weight * t, scale * (turn * t + weight * t1)
+    e2 = scale * scale * (2.0 * (turn * t1 - t) + weight * t2)
+    s1 = 0.5 * c * c * inverse
+    s2 = s1 * (s1 + c * c * (k * b + (1.0 + k) * a) * inverse)
+    slope = slope + secant * (e1 + e * s1)
+    return by_radius(x, y, slope, second + secant * (e2 + 2.0 * e1 * s1 + e * s2))
+
+
+def q_bfs_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_sag: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of c, k and the coefficients.
+
+    c and k turn the normal: with κ = c² and Λ = σ'/σ = κ/(2ab), σ_κ = σ·r²/(2ab), σ_k =
+    σ·κ²r⁴/(2ab), Λ_κ = (1 + κr²·(k·b + (1+k)·a)/(ab))/(2ab) and Λ_k = κ²r²·(a + b)/(2a²b²).
+    """
+    c, k, radius, terms = p
+    r2 = fma(x, x, y * y)
+    scale = divide(1.0, radius * radius)
+    of_slope = 2.0 * (of_x * x + of_y * y)
+    of_c, of_k = conic_cotangents(c, k, r2, of_sag, of_slope)
+    q = r2 * scale
+    t, t1 = _total(terms, q, c, 1.0)
+    a, b, secant, inverse = _secant(c, k, r2)
+    weight, turn, kappa = q * (1.0 - q), 1.0 - 2.0 * q, c * c
+    e, e1 = weight * t, scale * (turn * t + weight * t1)
+    s1 = 0.5 * kappa * inverse
+    of_secant = of_sag * e + of_slope * (e1 + e * s1)
+    mixed = kappa * r2 * inverse * (k * b + (1.0 + k) * a)
+    share, bent = 0.5 * secant * inverse, kappa * kappa * r2
+    of_kappa = share * (of_secant * r2 + of_slope * e * (1.0 + mixed))
+    put(cotangents, 0, of_c + 2.0 * c * of_kappa)
+    of_turn = share * bent * (of_secant * r2 + of_slope * e * (a + b) * inverse)
+    put(cotangents, 1, of_k + of_turn)
+    of_value = secant * (of_sag * weight + of_slope * (scale * turn + weight * s1))
+    of_derivative = secant * of_slope * scale * weight
+    _put_terms(cotangents, terms, q, c, 1.0, of_value, of_derivative)
+
+
+_LAYOUT = (None, None, None, Code.COLUMNS)
+Q_CON = Shape("q_con", q_con_sag, q_con_hessian, q_con_parameters, _LAYOUT, starts_on_conic=True)
+Q_BFS = Shape("q_bfs", q_bfs_sag, q_bfs_hessian, q_bfs_parameters, _LAYOUT, starts_on_conic=True)
 
 
 class ForbesSag(Surface):
@@ -78,29 +294,14 @@ class QCon(ForbesSag):
     """
 
     kind = "q_con"
-    kernel = SurfaceKernel(*_KERNELS)
+    shape = Q_CON
     rotational = True
 
     @classmethod
-    def sag_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return sag and slopes, and the margin of the conic's branch."""
-        r2 = torch.addcmul(x * x, y, y)
-        sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
-        scale = 1.0 / p["normalization_radius"] ** 2
-        q = r2 * scale
-        total, derivative = _series(p, jacobi(q, 4, _count(p)), q)
-        slope = slope + scale * q * (2.0 * total + q * derivative)
-        return sag + q * q * total, 2.0 * x * slope, 2.0 * y * slope, exists
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters) -> PackedShape:
-        """Return c, k, no a2, the normalisation radius, and q0, q1, ...; columns: how many."""
-        count = _count(p)
-        numbers = (p["curvature"], p["conic"], None, p["normalization_radius"])
-        return PackedShape((*numbers, *(p.get(f"q{m}") for m in range(count))), columns=count)
+    def numbers(cls, p: Parameters) -> tuple[Any, ...]:
+        """Return c, k, the normalisation radius, and q0, q1, ...."""
+        terms = tuple(p.get(f"q{m}", 0.0) for m in range(_count(p)))
+        return p["curvature"], p["conic"], p["normalization_radius"], terms
 
 
 @register_surface
@@ -115,57 +316,22 @@ class QBfs(ForbesSag):
     """
 
     kind = "q_bfs"
-    kernel = SurfaceKernel(*_KERNELS)
+    shape = Q_BFS
     rotational = True
 
     @classmethod
-    def sag_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return sag and slopes, and the margin of the conic's branch.
-
-        With a = 1 - k·c²r² and b = a - c²r²: σ = √(a/b), and dσ/d(r²) = σ·c²/(2ab).
-        """
-        c, k = p["curvature"], p["conic"]
-        r2 = torch.addcmul(x * x, y, y)
-        sag, slope, _ = conic_sag(c, k, r2)
-        scale = 1.0 / p["normalization_radius"] ** 2
-        q = r2 * scale
-        total, derivative = _series(p, q_bfs(q, _count(p)), q)
-        turned = c * c * r2
-        squared = 1.0 - (1.0 + k) * turned
-        b = squared.clamp(min=_STEEPEST)
-        a = b + turned
-        secant = torch.sqrt(a / b)
-        departure = q * (1.0 - q) * total
-        along = scale * ((1.0 - 2.0 * q) * total + q * (1.0 - q) * derivative)
-        slope = slope + secant * (along + (0.5 * (c * c)) * departure / (a * b))
-        exists = squared.detach() - _STEEPEST
-        return sag + departure * secant, 2.0 * x * slope, 2.0 * y * slope, exists
+    def numbers(cls, p: Parameters) -> tuple[Any, ...]:
+        """Return c, k, the normalisation radius, and the coefficients of auxiliary polynomials."""
+        count, terms = _count(p), tuple[Tensor, ...]()
+        if count:
+            given = torch.stack([p.get(f"q{m}", _zero(p)) for m in range(count)])
+            terms = (torch.from_numpy(to_auxiliary(count)).to(given) @ given).unbind()
+        return p["curvature"], p["conic"], p["normalization_radius"], terms
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """Return c, k, no a2, the normalisation radius, and the coefficients of auxiliary
-        polynomials; columns: how many; degree: 1.
-        """
-        count = _count(p)
-        numbers = [p["curvature"], p["conic"], None, p["normalization_radius"]]
-        if count:
-            given = torch.stack([p.get(f"q{m}", _zero(p)) for m in range(count)])
-            numbers.append(torch.from_numpy(to_auxiliary(count)).to(given) @ given)
-        return PackedShape(tuple(numbers), columns=count, degree=1)
-
-
-def _series(
-    p: Parameters, polynomials: Iterable[tuple[Tensor, Tensor]], q: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return Σ q_m·Q_m and its derivative, from the polynomials with theirs, at q."""
-    total, derivative = torch.zeros_like(q), torch.zeros_like(q)
-    for m, (value, d) in enumerate(polynomials):
-        if f"q{m}" in p:
-            total = total + p[f"q{m}"] * value
-            derivative = derivative + p[f"q{m}"] * d
-    return total, derivative
+        """Return the numbers; they are computed, and not stored."""
+        return super().packed(p)
 
 
 def _count(p: Parameters) -> int:
@@ -186,32 +352,6 @@ def _factors(count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[fl
         g.append(-(1.0 + g[m - 2] * h[m - 2]) / f[m - 1])
         f.append(math.sqrt(m * (m + 1) + 3.0 - g[m - 1] ** 2 - h[m - 2] ** 2))
     return tuple(f), tuple(g), tuple(h)
-
-
-def q_bfs(q: Tensor, count: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield Q_m at q = u² and its derivative in q, for m = 0, 1, ..., count - 1.
-
-    The auxiliary polynomials are P_0 = 2, P_1 = 6 - 8q, P_(m+1) = (2 - 4q)·P_m - P_(m-1).
-    """
-    f, g, h = _factors(count)
-    zero = q * 0.0
-    here, slope, after, after_slope = zero + 2.0, zero, 6.0 - 8.0 * q, zero - 8.0
-    last: list[tuple[Tensor, Tensor]] = []
-    for m in range(count):
-        value, d = here, slope
-        if m > 0:
-            value, d = value - g[m - 1] * last[-1][0], d - g[m - 1] * last[-1][1]
-        if m > 1:
-            value, d = value - h[m - 2] * last[-2][0], d - h[m - 2] * last[-2][1]
-        last = [*last[-1:], (value / f[m], d / f[m])]
-        yield last[-1]
-        factor = 2.0 - 4.0 * q
-        here, slope, after, after_slope = (
-            after,
-            after_slope,
-            factor * after - here,
-            factor * after_slope - 4.0 * after - slope,
-        )
 
 
 @cache

@@ -1,0 +1,254 @@
+"""A shape's functions are compiled for a precision, and inlined in the loop over a block's rays.
+
+Numba inlines them, before LLVM sees them: the loops over a series, whose length is then a constant,
+are unrolled (up to 127 numbers), and the loop over rays is vectorised.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, njit, types
+from numba.core import cgutils
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
+
+from dolens.kernels import operations
+from dolens.kernels.cpu.arithmetic import arithmetic
+from dolens.kernels.cpu.compiler import OPTIONS, Factory, Row, StepFunctions, pointer, shifted
+from dolens.kernels.cpu.explicit import given_by_sag
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    MARGIN,
+    OF_SAG,
+    OF_SHAPE,
+    OF_SLOPE_X,
+    OF_SLOPE_Y,
+    POINT_X,
+    POINT_Y,
+    SAG,
+    SAG_XX,
+    SAG_XY,
+    SAG_YY,
+    SHAPE,
+    SLOPE_X,
+    SLOPE_Y,
+    WORK_SIZE,
+)
+from dolens.kernels.shapes import Shape, functions_within, translated
+
+_INTEGER = ir.IntType(64)
+_AS_REAL = {types.float32: np.float32, types.float64: np.float64}
+
+
+@cache
+def _operations(real: types.Type) -> dict[Any, Any]:
+    """Return what takes the place of `dolens.kernels.operations`: single instructions, mostly."""
+
+    def require(name: str, *kinds: types.Type) -> None:
+        if any(kind != real for kind in kinds):
+            raise TypingError(f"{name} takes numbers of {real}, not {kinds}: write 2.0 for 2")
+
+    @intrinsic
+    def fma(context, a, b, c):  # noqa: ANN001, ANN202
+        require("fma", a, b, c)
+        return real(a, b, c), lambda _, builder, __, given: builder.fadd(
+            builder.fmul(given[0], given[1]), given[2]
+        )
+
+    @intrinsic
+    def divide(context, a, b):  # noqa: ANN001, ANN202
+        require("divide", a, b)
+        return real(a, b), lambda _, builder, __, given: builder.fdiv(*given)
+
+    @intrinsic
+    def sqrt(context, a):  # noqa: ANN001, ANN202
+        require("sqrt", a)
+
+        def generate(context, builder, signature, given):  # noqa: ANN001, ANN202
+            kind = given[0].type
+            root = builder.module.declare_intrinsic("llvm.sqrt", [kind])
+            return builder.call(root, given)
+
+        return real(a), generate
+
+    @intrinsic
+    def where(context, condition, a, b):  # noqa: ANN001, ANN202
+        require("where", a, b)
+        return real(condition, a, b), lambda _, builder, __, given: builder.select(*given)
+
+    @intrinsic
+    def zero(context, like):  # noqa: ANN001, ANN202
+        return real(like), lambda context, *_: context.get_constant(real, 0.0)
+
+    @intrinsic
+    def number(context, integer, like):  # noqa: ANN001, ANN202
+        return real(types.int64, like), lambda context, builder, _, given: builder.sitofp(
+            given[0], context.get_value_type(real)
+        )
+
+    @intrinsic
+    def length(context, series):  # noqa: ANN001, ANN202
+        return types.int64(series), lambda _, builder, __, given: builder.extract_value(given[0], 1)
+
+    @intrinsic
+    def term(context, series, i):  # noqa: ANN001, ANN202
+        return real(series, types.int64), lambda _, builder, __, given: builder.load(
+            builder.gep(builder.extract_value(given[0], 0), [given[1]])
+        )
+
+    @intrinsic
+    def put(context, cotangents, place, value):  # noqa: ANN001, ANN202
+        require("put", value)
+
+        def generate(context, builder, signature, given):  # noqa: ANN001, ANN202
+            place = builder.mul(given[1], _INTEGER(BLOCK))
+            builder.store(given[2], builder.gep(given[0], [place]))
+            return context.get_dummy_value()
+
+        return types.void(cotangents, types.int64, value), generate
+
+    own = (fma, divide, sqrt, where, zero, number, length, term, put)
+    known = {getattr(operations, one.__name__): one for one in own}
+    return known | {operations.safe_sqrt: arithmetic(real).safe_sqrt}
+
+
+@cache
+def _translations(real: types.Type) -> dict[Any, Any]:
+    return dict(_operations(real))
+
+
+def _compiled(function: Callable[..., Any], real: types.Type) -> Any:
+    """Return a shape's function for a precision, inlined where it is called."""
+    literal = _AS_REAL[real]
+    return translated(
+        function,
+        _translations(real),
+        njit(inline="always", **OPTIONS),
+        literal,
+        lambda value: literal(value) if isinstance(value, float) else value,
+    )
+
+
+def _unpacked(real: types.Type, sizes: Sequence[int | None]) -> Any:
+    """Return the function of a pointer that reads a shape's numbers: p of `Shape`.
+
+    A series is a place on the stack and its length: LLVM keeps it in registers.
+
+    Args:
+        real: the precision.
+        sizes: of each part: None of a single number, else the length of a series.
+    """
+    series = types.Tuple((pointer(real), types.int64))
+    parts = types.Tuple([real if size is None else series for size in sizes])
+
+    def generate(context, builder, signature, given):  # noqa: ANN001, ANN202
+        place, values = 0, []
+
+        def following():  # noqa: ANN202
+            nonlocal place
+            place += 1
+            return builder.load(builder.gep(given[0], [_INTEGER(place - 1)]))
+
+        for size in sizes:
+            if size is None:
+                values.append(following())
+                continue
+            kind = ir.ArrayType(context.get_value_type(real), max(size, 1))
+            slot = builder.gep(cgutils.alloca_once(builder, kind), [_INTEGER(0), _INTEGER(0)])
+            for k in range(size):
+                builder.store(following(), builder.gep(slot, [_INTEGER(k)]))
+            values.append(context.make_tuple(builder, series, [slot, _INTEGER(size)]))
+        return context.make_tuple(builder, parts, values)
+
+    @intrinsic
+    def unpacked(context, base):  # noqa: ANN001, ANN202
+        return parts(base), generate
+
+    return unpacked
+
+
+def _factory(
+    function: Callable[..., Any],
+    block: Callable[[Any, Any], Callable[..., None]],
+    name: str,
+    sizes: tuple[int | None, ...],
+) -> Factory:
+    """Return the factory of a block function that inlines a shape's function.
+
+    Args:
+        function: the shape's.
+        block: makes the block function from the compiled function and what reads p.
+        name: of the kernel.
+        sizes: of the parts of p.
+    """
+
+    def factory(real: types.Type) -> Callable[..., None]:
+        return block(_compiled(function, real), _unpacked(real, sizes))
+
+    factory.__name__, factory.__qualname__ = name, f"{name}{sizes}"
+    factory.within = functions_within(function)  # type: ignore[attr-defined]
+    return factory
+
+
+def _sag_block(sag: Any, unpacked: Any) -> Callable[..., None]:
+    def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
+        w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
+        for i in range(BLOCK):
+            s, sx, sy, margin = sag(p, w[POINT_X + i], w[POINT_Y + i])
+            w[SAG + i], w[SLOPE_X + i], w[SLOPE_Y + i], w[MARGIN + i] = s, sx, sy, margin
+
+    return kernel
+
+
+def _hessian_block(sag_hessian: Any, unpacked: Any) -> Callable[..., None]:
+    def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
+        w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
+        for i in range(BLOCK):
+            sx, sy, sxx, sxy, syy = sag_hessian(p, w[POINT_X + i], w[POINT_Y + i])
+            w[SLOPE_X + i], w[SLOPE_Y + i] = sx, sy
+            w[SAG_XX + i], w[SAG_XY + i], w[SAG_YY + i] = sxx, sxy, syy
+
+    return kernel
+
+
+def _parameters_block(parameters: Any, unpacked: Any) -> Callable[..., None]:
+    def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
+        w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
+        for i in range(BLOCK):
+            parameters(
+                shifted(cotangents, OF_SHAPE + i), p, w[POINT_X + i], w[POINT_Y + i],
+                w[OF_SAG + i], w[OF_SLOPE_X + i], w[OF_SLOPE_Y + i],
+            )  # fmt: skip
+
+    return kernel
+
+
+@cache
+def _step_functions(shape: Shape, sizes: tuple[int | None, ...]) -> StepFunctions:
+    parts = (
+        (shape.sag, _sag_block, "sag"),
+        (shape.sag_hessian, _hessian_block, "hessian"),
+        (shape.parameters, _parameters_block, "parameters"),
+    )
+    made = (_factory(f, block, f"{shape.name}_{part}", sizes) for f, block, part in parts)
+    numbers = sum(1 if size is None else size for size in sizes)
+    return given_by_sag(*made, starts_on_conic=shape.starts_on_conic, numbers=numbers)
+
+
+class ShapeKernels(NamedTuple):
+    """The kernels of a shape differ with the lengths of its series."""
+
+    shape: Shape
+
+    def of(self, row: Row) -> StepFunctions:
+        """Return the functions of a step with this row of codes."""
+        layout = self.shape.layout
+        return _step_functions(
+            self.shape, tuple(None if place is None else int(row[place]) for place in layout)
+        )
+
+
+kernels = ShapeKernels

@@ -1,0 +1,149 @@
+"""A shape's functions are compiled for a block of rays; a series is a pointer and its length."""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import triton
+import triton.language as tl
+from triton.runtime.interpreter import InterpretedFunction
+
+from dolens.kernels import operations
+from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
+from dolens.kernels.cuda.functions import SagFunctions
+from dolens.kernels.cuda.layout import SHAPE
+from dolens.kernels.shapes import Shape, shape_named, translated
+
+
+@triton.jit
+def fma(a, b, c):
+    """Return a·b + c."""
+    return a * b + c
+
+
+@triton.jit
+def sqrt(a):
+    """Return the square root, rounded to nearest."""
+    if a.dtype == tl.float64:
+        return tl.sqrt(a)
+    else:
+        return tl.sqrt_rn(a)
+
+
+@triton.jit
+def where(condition, a, b):
+    """Return a where the condition holds, and else b."""
+    return tl.where(condition, a, b)
+
+
+@triton.jit
+def zero(like):
+    """Return zero for each ray."""
+    return tl.zeros_like(like)
+
+
+@triton.jit
+def number(integer, like):
+    """Return an integer as a number of another's precision; with a literal it would be single."""
+    return integer + tl.zeros_like(like)
+
+
+@triton.jit
+def length(series):
+    """Return how many numbers a series has."""
+    return series[1]
+
+
+@triton.jit
+def term(series, i):
+    """Return a number of a series."""
+    return tl.load(series[0] + i)
+
+
+@triton.jit
+def put(cotangents, place, value):
+    """Add a number's cotangents to its sum; see `add_sum`."""
+    add_sum(cotangents[0] + place, value, cotangents[1])
+
+
+_OPERATIONS = {
+    getattr(operations, name): made
+    for name, made in {
+        "fma": fma, "divide": divide, "sqrt": sqrt, "safe_sqrt": safe_sqrt, "where": where,
+        "zero": zero, "number": number, "length": length, "term": term, "put": put,
+    }.items()
+}  # fmt: skip
+
+
+def _constant(value: Any) -> Any:
+    """Return a number as Triton takes it; any other thing is the type of an argument."""
+    return tl.constexpr(value) if isinstance(value, int | float) else tl.tensor
+
+
+def _compiled(function: Callable[..., Any]) -> Any:
+    """Return a shape's function, compiled by Triton where it is called."""
+    return translated(function, _OPERATIONS, triton.jit, lambda literal: literal, _constant)
+
+
+@triton.jit
+def _unpacked(place, codes, LAYOUT: tl.constexpr):
+    """Return p of a `Shape` from the place of its numbers."""
+    p = ()
+    for k in tl.static_range(len(LAYOUT)):
+        if LAYOUT[k] < 0:
+            p = p + (tl.load(place),)  # type: ignore[assignment]  # noqa: RUF005
+            place += 1
+        else:
+            count = tl.load(codes + LAYOUT[k])
+            p = p + ((place, count),)  # type: ignore[assignment]  # noqa: RUF005
+            place += count
+    return p
+
+
+# The names in capitals are bound for each shape.
+def _sag(record, codes, extras, x, y):
+    return FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
+
+
+def _hessian(record, codes, extras, x, y):
+    sx, sy, sxx, sxy, syy = FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
+    # A derivative may be one for all rays.
+    return (
+        tl.broadcast_to(sx, x.shape),
+        tl.broadcast_to(sy, x.shape),
+        tl.broadcast_to(sxx, x.shape),
+        tl.broadcast_to(sxy, x.shape),
+        tl.broadcast_to(syy, x.shape),
+    )
+
+
+def _add_sums(record, codes, extras, sums, x, y, of_sag, of_x, of_y, alive):
+    p = _unpacked(record + SHAPE, codes, LAYOUT)  # noqa: F821
+    FUNCTION((sums + SHAPE, alive), p, x, y, of_sag, of_x, of_y)  # noqa: F821
+
+
+@cache
+def kernels(shape: Shape) -> SagFunctions:
+    """Return the three functions of a shape."""
+    layout: Any = tuple(-1 if place is None else int(place) for place in shape.layout)
+    if not isinstance(_unpacked, InterpretedFunction):
+        layout = tl.constexpr(layout)
+
+    def bound(wrapper: Any, function: Callable[..., Any], part: str) -> Any:
+        names = {**wrapper.__globals__, "FUNCTION": _compiled(function), "LAYOUT": layout}
+        copy = FunctionType(wrapper.__code__, names, wrapper.__name__)
+        # Triton tells functions from each other by module and name.
+        copy.__module__, copy.__qualname__ = __name__, f"{shape.name}_{part}"
+        return triton.jit(copy)
+
+    return SagFunctions(
+        bound(_sag, shape.sag, "sag"),
+        bound(_hessian, shape.sag_hessian, "hessian"),
+        bound(_add_sums, shape.parameters, "sums"),
+        starts_on_conic=shape.starts_on_conic,
+    )
+
+
+# The asphere that other shapes add to.
+even_asphere_sag, even_asphere_hessian, even_asphere_sums, *_ = kernels(shape_named("even_asphere"))
