@@ -58,6 +58,9 @@ class CameraOptimizer:
         check_choice(lens, ("adam", "dls"), "optimizer.lens")
         if not 0.0 <= until <= 1.0:
             raise InputError(f"optimizer.until: {until}; allowed: 0 to 1")
+        if "lr" in getattr(network, "keywords", {}):
+            message = "nothing reads it; learning_rates.network is the rate"
+            raise InputError(f"optimizer.network.lr: {message}")
         self.until = float(until)
         self.network = network
         # Settings of what another choice would use are checked as well.

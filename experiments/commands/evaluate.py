@@ -108,8 +108,6 @@ def evaluate(
     run = load_recorded(record, config, checkpoint, with_loss)
     (output / ".hydra").mkdir(parents=True)
     with _log_file(output / "log.txt"):
-        for note in record.notes:
-            logger.warning("%s", note)
         _say(run, changed)
         OmegaConf.save(run.cfg, output / RESOLVED)
         written = [*record.overrides, *overrides]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -181,6 +182,8 @@ def test_a_first_design_out_of_range_is_an_error(settings, message):
 def test_a_share_out_of_range_is_an_error():
     with pytest.raises(InputError, match=r"optimizer\.until: 1\.5; allowed: 0 to 1"):
         CameraOptimizer(torch.optim.Adam, until=1.5)
+    with pytest.raises(InputError, match=r"optimizer.network.lr: .* learning_rates.network is"):
+        CameraOptimizer(partial(torch.optim.Adam, lr=0.1))
 
 
 def test_the_plate_that_a_network_learned_has_the_least_deconvolved_error(composed, tmp_path):
