@@ -207,7 +207,7 @@ def test_a_command_about_a_lens_runs(words, in_it, here, monkeypatch):
         return
     if {"--html", "--figures"} & {*words} and words != FIRST_PAGE:
         (here / "lens.html").unlink(missing_ok=True)
-        monkeypatch.setattr("dolens.lens_page.write_page", nothing_drawn)
+        monkeypatch.setattr("dolens.lens_page.page.write_page", nothing_drawn)
     variables = [word.split("=") for word in words[: words.index("dolens")]]
     for name, value in variables:
         monkeypatch.setenv(name, value.replace("~", str(here)))

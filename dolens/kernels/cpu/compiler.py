@@ -165,7 +165,7 @@ def source_of(factory: Factory) -> tuple[str, ...]:
     """
     digest = hashlib.sha256()
     for one in getattr(factory, "within", (factory,)):
-        path = Path(inspect.getsourcefile(one) or "")
+        path = Path(inspect.getsourcefile(inspect.unwrap(one)) or "")
         if not path.is_file():
             raise RuntimeError(f"the source of {one.__qualname__} is in no file")
         digest.update(path.read_bytes())
