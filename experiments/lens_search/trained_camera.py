@@ -171,11 +171,6 @@ def _reason(output: Path, status: int) -> str:
     return (last or f"its process ended with status {status}")[-_REASON:]
 
 
-def stages_of(task: CameraTask) -> tuple[str, ...]:
-    """Return the stages whose tables of photographs a finished rung has left."""
-    return (stage_of(task.epochs), "test") if task.tested else (stage_of(task.epochs),)
-
-
 def stage_of(epochs: int) -> str:
     """Return the stage whose table has the validation after so many epochs."""
     return f"val_{epochs}_epochs"
