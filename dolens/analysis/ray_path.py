@@ -21,6 +21,7 @@ from dolens.optics.trace import (
     Trace,
     distance_to_plane,
     enter_lens,
+    first_failure,
     meet,
     trace_surfaces,
     trace_to_sensor,
@@ -39,8 +40,8 @@ class Crossing:
 
     Attributes:
         surface: its number and kind, or `sensor`.
-        point: mm, in the lens's axes.
-        direction: cosines behind it, in the lens's axes.
+        point: mm, in the lens's axes; on the sensor in its own, as `Lens.trace` gives it.
+        direction: cosines behind it, in the same axes.
         incidence: degrees between the ray in front of it and the normal; NaN on the sensor.
         height: mm, distance from the surface's own vertex, across its axis.
         semi_diameter: mm, of the clear aperture; NaN on the sensor.
@@ -104,58 +105,46 @@ def ray_path(lens: Lens, rays: Rays) -> RayPath:
         raise InputError(f"a path is that of one ray, not of {components.x.numel()}")
     exact = in_double_precision(lens)
     system, wavelength = exact.system(), rays.wavelength
-    entering, _ = enter_lens(system, rays, 1, 1.0)
-    before, axes = Components(*(c.reshape(()) for c in entering)), LENS_AXES
-    start = before
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.reshape(())
+    entering, _ = enter_lens(system, rays, 1, 1.0)
+    ray = Components(*(c.reshape(()) for c in entering))
+    landed = trace_to_sensor(system, trace_surfaces(system, ray, wavelength), wavelength)
+    status, last = (int(value) for value in first_failure(landed))
     crossings: list[Crossing] = []
-    vignetted, traced = "", None
-    status = Status.OK
+    ending = "sensor: the ray does not travel to it" if status else "the ray reaches the sensor"
     for number, surface in enumerate(system.surfaces, 1):
         if surface.shape.changes_axes:
             continue
-        traced = trace_surfaces(system, start, wavelength, record=True, last=number)
-        here, _ = change_axes(before, axes, system.axes[number - 1])
-        sense = system.senses[number - 1]
+        here, _ = change_axes(ray, LENS_AXES, system.axes[number - 1])
+        sense, is_last = system.senses[number - 1], number == last
+        if is_last and status == Status.MISSED:
+            ending = f"surface {number}: {_why_missed(surface, here, sense)}"
+            break
         meeting = meet(surface, here, sense, system.from_the_side)
-        margins = traced.margins[-1]
-        if not _holds(margins.met):
-            reason = f"surface {number}: {_why_missed(surface, here, sense)}"
-            return _ended(exact, wavelength, crossings, Status.MISSED, reason)
-        crossing = _crossing(number, surface, here, meeting, traced)
-        crossings.append(crossing)
-        if not _holds(margins.inside) and not vignetted:
-            status = Status.VIGNETTED
-            vignetted = (
-                f"surface {number}: vignetted: {crossing.height:.4f} mm from the axis, and the "
-                f"clear aperture reaches {surface.semi_diameter:.4f} mm at most"
+        step = trace_surfaces(system, ray, wavelength, record=True, first=number, last=number)
+        ray = step.ray
+        crossings.append(_crossing(number, surface, here, meeting, step))
+        if is_last and status == Status.TIR:
+            reason = _why_reflected(system, wavelength, number, surface, crossings[-1])
+            ending = f"surface {number}: {reason}"
+            break
+        if is_last:
+            ending = (
+                f"surface {number}: vignetted: {crossings[-1].height:.4f} mm from the axis, and "
+                f"the clear aperture reaches {surface.semi_diameter:.4f} mm at most"
             )
-        if not _holds(margins.transmitted):
-            reason = _why_reflected(system, wavelength, number, surface, crossing)
-            return _ended(exact, wavelength, crossings, Status.TIR, f"surface {number}: {reason}")
-        before, axes = traced.local, traced.axes
-    assert traced is not None  # a lens has a surface that light meets
-    landed = trace_to_sensor(system, traced, wavelength)
-    if not _holds(landed.margins[-1].met):
-        return _ended(
-            exact, wavelength, crossings, Status.MISSED, "sensor: the ray does not travel to it"
-        )
-    x, y, z, l, m, n = (float(c) for c in landed.ray)  # noqa: E741
-    height = math.hypot(x, y)
-    crossings.append(Crossing("sensor", (x, y, z), (l, m, n), math.nan, height, math.nan))
-    return _ended(exact, wavelength, crossings, status, vignetted or "the ray reaches the sensor")
+    else:
+        if status != Status.MISSED:
+            x, y, z, l, m, n = (float(c) for c in landed.ray)  # noqa: E741
+            height = math.hypot(x, y)
+            crossings.append(Crossing("sensor", (x, y, z), (l, m, n), math.nan, height, math.nan))
+    heading = f"{printable(exact.name) or 'Lens'}: a ray of {float(wavelength):g} nm"
+    return RayPath(heading, tuple(crossings), Status(status), ending)
 
 
 def _holds(margin: Tensor | None) -> bool:
     return margin is None or bool(margin > 0.0)
-
-
-def _ended(
-    lens: Lens, wavelength: float | Tensor, rows: list[Crossing], status: Status, ending: str
-) -> RayPath:
-    heading = f"{printable(lens.name) or 'Lens'}: a ray of {float(wavelength):g} nm"
-    return RayPath(heading, tuple(rows), status, ending)
 
 
 def _crossing(

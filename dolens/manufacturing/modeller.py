@@ -26,10 +26,13 @@ from dolens.optics.surfaces.conic import Conic
 _SHARE = 0.1
 _FIRST_SPANS = 16
 _MOST_SPANS = 4096
+# Spans of a surface, along x and along y.
+_FIRST_SPANS_ACROSS = 4
+_MOST_SPANS_ACROSS = 256
 # Points within each span at which a fit is looked at; none of them is a knot.
+_BETWEEN = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
 # Share of the reach at which the slope at the vertex is taken.
 _BESIDE = 1e-12
-_BETWEEN = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
 # Arcs of larger radii are Bézier arcs: a centre 10 km away would cost the vertex its last digits.
 _LARGEST_RADIUS = 1e7
 
@@ -174,12 +177,6 @@ def _is_conic(face: Face) -> bool:
     return issubclass(face.shape, Conic) and all(float(p) == 0.0 for p in further)
 
 
-_SHARE_OF_TOLERANCE = 0.1
-_FIRST_SPANS_ACROSS = 4
-_MOST_SPANS_ACROSS = 256
-_BETWEEN_KNOTS = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
-
-
 @dataclass(frozen=True)
 class TensorSpline:
     """z(x, y) = Σ c_ij·N_i(x)·N_j(y) with cubic B-splines N.
@@ -231,14 +228,14 @@ def tensor_spline(face: Face, reach: float, used: float, tolerance: float) -> Te
         inner = np.linspace(-reach, reach, spans + 1)
         knots = np.concatenate([[-reach] * 3, inner, [reach] * 3])
         spline = _collocated(face, knots, knots)
-        between = -reach + (np.arange(spans)[:, None] + np.array(_BETWEEN_KNOTS)).ravel() * (
+        between = -reach + (np.arange(spans)[:, None] + np.array(_BETWEEN)).ravel() * (
             2.0 * reach / spans
         )
         x, y = (grid.ravel() for grid in np.meshgrid(between, between))
         inside = np.hypot(x, y) <= used
         x, y = x[inside], y[inside]
         error = np.abs(spline(x, y) - face.sag(x, y)).max()
-        if error <= _SHARE_OF_TOLERANCE * tolerance:
+        if error <= _SHARE * tolerance:
             return spline
         spans *= 2
     raise InputError(

@@ -232,16 +232,6 @@ class Lens(LensRays, InStates, nn.Module):
         """The device that the parameters live on."""
         return self.sensor_distance.device
 
-    def __getattr__(self, name: str) -> Any:
-        """Return a parameter or part, or a method that a higher part of the library has."""
-        if name in LENS_METHODS:
-            return MethodType(getattr(resolve_name(LENS_METHODS[name]), name), self)
-        return super().__getattr__(name)
-
-    def __dir__(self) -> list[str]:
-        """Return all names, those of `LENS_METHODS` too."""
-        return sorted({*super().__dir__(), *LENS_METHODS})
-
     def __repr__(self) -> str:
         """Return the prescription as a table."""
         return self.prescription().text()
@@ -411,6 +401,27 @@ class Lens(LensRays, InStates, nn.Module):
             raise InputError(
                 f"lens '{self.name}': surfaces {first} to {last} are no range of 1 to {count}"
             )
+
+
+class _LoadedMethod:
+    """A method of `Lens` stands in a higher part of the library, and is loaded when it is used.
+
+    Args:
+        home: the class that has it, as `dolens.views.LensViews`.
+        name: of the method.
+    """
+
+    def __init__(self, home: str, name: str) -> None:
+        self.home, self.name = home, name
+
+    def __get__(self, lens: Lens | None, owner: type[Lens]) -> Any:
+        """Return the method, bound to a lens."""
+        function = getattr(resolve_name(self.home), self.name)
+        return function if lens is None else MethodType(function, lens)
+
+
+for _name, _home in LENS_METHODS.items():
+    setattr(Lens, _name, _LoadedMethod(_home, _name))
 
 
 def _stored_or_given(

@@ -166,18 +166,8 @@ class ParaxialNumbers:
         numbers = torch.stack(
             [torch.as_tensor(s, dtype=torch.float64, device=system.device) for s in scalars]
         ).tolist()
-        count = len(curvatures)
-        return cls(
-            tuple(numbers[:count]),
-            tuple(numbers[count : 2 * count - 1]),
-            numbers[2 * count - 1],
-            tuple(system.materials),
-            system.stop,
-            float(system.surfaces[system.stop - 1].semi_diameter),
-            system.senses,
-            _pairs(numbers[2 * count : 2 * count + len(powers)]),
-            tuple(numbers[2 * count + len(powers) :]),
-        )
+        radius = float(system.surfaces[system.stop - 1].semi_diameter)
+        return cls._of_numbers(system, numbers, radius, len(powers))
 
     @classmethod
     def differentiable(cls, system: OpticalSystem) -> "ParaxialNumbers | None":
@@ -186,22 +176,29 @@ class ParaxialNumbers:
         """
         curvatures, powers, offsets = curvatures_of(system), _powers(system), _offsets(system)
         radius = system.surfaces[system.stop - 1].edge_radius
-        lengths = [*system.thicknesses, system.sensor_distance, radius]
-        scalars = [*curvatures, *lengths, *powers, *offsets]
+        lengths = [*system.thicknesses, system.sensor_distance]
+        scalars = [*curvatures, *lengths, *powers, *offsets, radius]
         if not any(isinstance(s, Tensor) and s.requires_grad for s in scalars):
             return None
-        numbers = [torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars]
-        count = len(curvatures)
+        *numbers, edge = (torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars)
+        return cls._of_numbers(system, numbers, edge, len(powers))
+
+    @classmethod
+    def _of_numbers(
+        cls, system: OpticalSystem, numbers: Sequence[Any], radius: Any, powers: int
+    ) -> "ParaxialNumbers":
+        """Take apart curvatures, gaps, the sensor's distance, powers and offsets, in this order."""
+        count = len(system.surfaces)
         return cls(
             tuple(numbers[:count]),
             tuple(numbers[count : 2 * count - 1]),
             numbers[2 * count - 1],
             tuple(system.materials),
             system.stop,
-            numbers[2 * count],
+            radius,
             system.senses,
-            _pairs(numbers[2 * count + 1 : 2 * count + 1 + len(powers)]),
-            tuple(numbers[2 * count + 1 + len(powers) :]),
+            _pairs(numbers[2 * count : 2 * count + powers]),
+            tuple(numbers[2 * count + powers :]),
         )
 
     @property

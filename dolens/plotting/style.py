@@ -144,8 +144,8 @@ def value_and_error(value: float, sigma: float) -> tuple[str, str]:
     return with_minus(shown), error
 
 
-# The share of a figure's width that titles may take.  Those of axes stand over the axes' middle,
-# which labels at the left push aside.
+# The share of a figure's width that titles and legends may take.  Titles of axes stand over the
+# middle of these, which labels at the left push aside.
 _FIGURE_SHARE, _AXES_TITLE_SHARE = 0.98, 0.82
 # Height of a line over the size of its text.
 _LEADING = 1.3
@@ -207,9 +207,6 @@ def _pieces(title: Text, line: str, room: float) -> list[str]:
 def _width(title: Text, line: str) -> float:
     title.set_text(line)
     return title.get_window_extent().width
-
-
-# The share of a figure's width that a legend may take.
 
 
 def legend_below(

@@ -99,6 +99,11 @@ class Finds:
         return real / continuous - 1.0
 
     @property
+    def has_map(self) -> bool:
+        """Return whether starts can be laid out in a plane: those of a single element cannot."""
+        return all(features.shape[1] > 1 for features in self.features.values())
+
+    @property
     def designs(self) -> int:
         """Return how many designs keep the specification."""
         return sum(len(designs.values) for designs, _ in self._all)
@@ -230,9 +235,8 @@ def search_figures(finds: Finds, reports: Sequence[FormReport], name: str) -> Fi
     if not finds.found:
         return {}
     found: dict[str, Callable[[], Figure]] = {"course": lambda: course_picture(finds, name)}
-    starts = starts_picture(finds, name)
-    if starts is not None:
-        found["starts"] = lambda: starts
+    if finds.has_map:
+        found["starts"] = lambda: starts_picture(finds, name)
     sections = sections_figure(reports, f"{name}: mean RMS spot of each form")
     return found if sections is None else {"forms": lambda: sections, **found}
 
@@ -246,10 +250,8 @@ def course_picture(finds: Finds, name: str) -> Figure:
     )
 
 
-def starts_picture(finds: Finds, name: str) -> Figure | None:
-    """Draw which start led where; None for single elements, whose starts have no map."""
-    if any(features.shape[1] < 2 for features in finds.features.values()):
-        return None
+def starts_picture(finds: Finds, name: str) -> Figure:
+    """Draw which start led where."""
     course = finds.course()
     firsts = sorted(finds.features)
     features = torch.cat([finds.features[first] for first in firsts])
@@ -290,7 +292,8 @@ def write_forms_page(finds: Finds, reports: Sequence[FormReport], folder: Path, 
         folder: of the run.
         name: of the experiment.
     """
-    pictures = Pictures(starts_picture(finds, name), course_picture(finds, name))
+    starts = starts_picture(finds, name) if finds.has_map else None
+    pictures = Pictures(starts, course_picture(finds, name))
     write_page(
         reports, folder, name, _facts(finds.specification), pictures, finds.forms, "merit (µm)"
     )

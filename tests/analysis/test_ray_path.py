@@ -7,6 +7,7 @@ import torch
 
 from dolens import InputError, Rays, Status, load_lens
 from dolens.analysis.ray_path import ray_path
+from tests.optics.test_coordinate_breaks import newtonian
 
 
 def ray(y, slope=0.0, z=-5.0, wavelength=587.5618):
@@ -35,6 +36,25 @@ def test_a_path_ends_as_the_trace_does_and_passes_its_points(name):
             if traced.valid:
                 assert crossing.point == pytest.approx(point.tolist(), abs=1e-9)
     assert Status.OK in ends and len(ends) > 1
+
+
+def test_a_path_follows_mirrors_and_coordinate_breaks():
+    telescope = newtonian()
+    given = ray(80.0, z=-900.0)
+    traced = telescope.trace(given, record=True)
+    found = telescope.explain(given)
+    assert found.status == Status.OK and [c.surface for c in found.crossings] == [
+        *(
+            f"{n} {s.kind}"
+            for n, s in enumerate(telescope.surfaces.values(), 1)
+            if not s.changes_axes
+        ),
+        "sensor",
+    ]
+    met = [p for p, s in zip(traced.points, telescope.surfaces.values(), strict=True)
+           if not s.changes_axes]  # fmt: skip
+    for crossing, point in zip(found.crossings, [*met, traced.position], strict=True):
+        assert crossing.point == pytest.approx(point.tolist(), abs=1e-9)
 
 
 def test_total_reflection_names_the_critical_angle():

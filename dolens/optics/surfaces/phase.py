@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
+from dolens.kernels.operations import safe_sqrt
 from dolens.kernels.surface_kernel import LawKernel
 from dolens.optics.surfaces.base import Parameters, by_names, tensor_of
 from dolens.optics.surfaces.deflection import (
@@ -36,7 +37,6 @@ from dolens.optics.surfaces.deflection import (
     Travel,
     Vector,
 )
-from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import order_of, order_pattern
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 

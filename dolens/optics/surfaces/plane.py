@@ -5,10 +5,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from dolens.kernels.operations import safe_sqrt
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
-from dolens.optics.surfaces.refraction import PlaneRay, Refraction, safe_sqrt
+from dolens.optics.surfaces.refraction import PlaneRay, Refraction
 from dolens.optics.surfaces.registry import register_surface
 
 

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.kernels.limits import LONGEST, TINY
+from dolens.kernels.limits import LONGEST
+from dolens.kernels.operations import safe_sqrt
 
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
@@ -37,13 +38,6 @@ class Refraction(NamedTuple):
     m: Tensor
     n: Tensor
     transmitted: Tensor
-
-
-def safe_sqrt(squared: Tensor) -> Tensor:
-    """Return the square root, with a finite derivative everywhere; exact where its argument is
-    positive.
-    """
-    return torch.sqrt(squared.clamp(min=TINY))
 
 
 def snell(

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from dolens.kernels.operations import safe_sqrt
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
-from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import checked_order, register_surface
 
 _MONOMIAL = re.compile(r"(?:(x)([2-9]|[1-9][0-9]+)?)?(?:(y)([2-9]|[1-9][0-9]+)?)?")
