@@ -154,7 +154,8 @@ def alternatives(overrides):
 
 @those("train")
 def test_a_training_is_composed_and_every_key_of_it_is_read(words, in_it, tmp_path):
-    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    given = [word for word in words if not word.startswith("-")]
+    overrides = [word for word in given if "=" in word or word.startswith("~")]
     use_working_folder()
     for run in alternatives(overrides):
         with composing(ROOT, tmp_path) as compose:
