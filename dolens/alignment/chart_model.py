@@ -7,12 +7,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dolens.alignment.chart import CHART_POSE, SENSOR_POSE, Chart, OnSensor, WeightedSums, on_sensor
 from dolens.alignment.gaussian_filters import smoothed_weights
+from dolens.analysis.pupil_quadrature import gaussian_rings
 from dolens.errors import InputError
 from dolens.optics.autograd import forward_columns
 from dolens.optics.dispersion import require_wavelengths
@@ -122,13 +122,12 @@ class ChartRays:
         """
         centres = self._starts(pose, places)[:, None]
         rho = rims[0] - self._depth(system, centres, rims[0]) / rims[1]
-        nodes, shares = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(self.rings))
-        squares, shares = 0.5 * (nodes + 1.0), 0.5 * shares
+        radii, shares = gaussian_rings(self.rings)
         offsets, parts = self.chart.quadrature()
         start = self.chart.in_lens_axes(
             self._places(places)[:, None] + (1.0 + larger) * offsets, pose
         )
-        reach = rho[..., None] * squares.sqrt()
+        reach = rho[..., None] * radii
         # Marks, points of a mark, arms, rings.
         ray, light = self._rays(start[:, :, None, None], reach[:, None])
         area = rho.square()[:, None, :, None] * shares * (parts / self.arms)[:, None, None]

@@ -27,11 +27,11 @@ from dolens.optics.lens_family import (
     intercept_parts,
     jacobian_parts,
     shared_rays,
+    traced_lens,
 )
 from dolens.optics.ray_tracing import choose_backend
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components, Rays, arrives
 from dolens.optics.system import require_plane_sensor
-from dolens.optics.trace import trace_surfaces, trace_to_sensor
 from dolens.optimize.image_quality import without_edges
 
 # Numbers that the kernels find at a time stay in the cache, 4 MB, where moments are made of them.
@@ -83,9 +83,10 @@ def spot_intercepts(lens: Lens, rays: Rays, names: Sequence[str]) -> SpotInterce
     """
     opened = without_edges(lens)
     ray = Components(*(c.double() for c in rays.components()))
+    own = Rays.from_components(ray, rays.wavelength)
     if choose_backend(opened.system(), rays) == "reference":
-        return ReferenceIntercepts(opened, tuple(names), ray, rays.wavelength)
-    wavelengths, shared = shared_rays(Rays.from_components(ray, rays.wavelength))
+        return ReferenceIntercepts(opened, tuple(names), own)
+    wavelengths, shared = shared_rays(own)
     return KernelIntercepts(LensFamily(opened, names, wavelengths), shared)
 
 
@@ -104,8 +105,8 @@ class KernelIntercepts:
     def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Yield what `SpotIntercepts.points` does."""
         size = self._lenses_at_a_time(_OF_A_RAY)
-        for rows, points, arrives in intercept_parts(self.family, values, self.rays, size):
-            yield rows, points.mT, ~arrives.all(-1)
+        for rows, points, arrive in intercept_parts(self.family, values, self.rays, size):
+            yield rows, points.mT, ~arrive.all(-1)
 
     def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Yield what `SpotIntercepts.derivatives` does; both are zero of a ray that is lost."""
@@ -125,19 +126,17 @@ class ReferenceIntercepts:
     Attributes:
         lens: whose apertures clip nothing.
         names: of F parameters.
-        ray: N of them.
-        wavelength: nm, theirs.
+        rays: N of them.
     """
 
     lens: Lens
     names: tuple[str, ...]
-    ray: Components
-    wavelength: float | Tensor
+    rays: Rays
 
     def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Yield what `SpotIntercepts.points` does."""
-        for rows, (points, margin) in self._batches(self._land, values, 1):
-            yield rows, points, ~(margin > 0.0)
+        for rows, (points, arrive) in self._batches(self._land, values, 1):
+            yield rows, points, ~arrive
 
     def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Yield what `SpotIntercepts.derivatives` does."""
@@ -160,7 +159,7 @@ class ReferenceIntercepts:
         Batches cannot have threads of their own: PyTorch counts the levels of forward derivatives
         for the whole process.
         """
-        size = max(1, _BY_REFERENCE // (copies * self.ray.x.numel()))
+        size = max(1, _BY_REFERENCE // (copies * len(self.rays.position)))
         first = 0
         for part in values.split(size):
             with one_thread():
@@ -169,13 +168,9 @@ class ReferenceIntercepts:
             first += len(part)
 
     def _land(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return points (2, N), mm, and the least of what ends a ray, positive where all arrive."""
-        system = self.lens.system(dict(zip(self.names, values.unbind(), strict=True)))
-        last = trace_surfaces(system, self.ray, self.wavelength)
-        traced = trace_to_sensor(system, last, self.wavelength)
-        ends = [m for row in traced.margins for m in (row.met, row.transmitted) if m is not None]
-        margin = torch.stack([end.detach().amin() for end in ends]).amin()
-        return torch.stack([traced.ray.x, traced.ray.y]), margin
+        """Return points (2, N), mm, and whether all rays arrive."""
+        hit = traced_lens(self.lens, self.names, values, self.rays)
+        return hit.position[:, :2].mT, arrives(hit.status).all()
 
 
 @contextmanager

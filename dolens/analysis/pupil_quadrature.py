@@ -181,10 +181,7 @@ def gaussian_quadrature(
         raise InputError(f"rings must be at least 1 and arms even, not {rings} and {arms}")
     if rings > _MOST_SIDE or arms > _MOST_SIDE:
         raise InputError(f"rings and arms: {rings} and {arms}; allowed: {_MOST_SIDE} at most")
-    nodes, half_shares = np.polynomial.legendre.leggauss(rings)
-    # Gauss and Legendre's nodes in ρ², on which an area's element is even.
-    radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
-    shares = torch.from_numpy(0.5 * half_shares)
+    radii, shares = gaussian_rings(rings)
     symmetric = symmetry and lens.system().rotationally_symmetric
 
     distinct = list(dict.fromkeys((float(x), float(y)) for x, y in fields))
@@ -207,6 +204,31 @@ def gaussian_quadrature(
             aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
         )
     return _passing(lens, fields, wavelengths, launched.__getitem__, symmetric)
+
+
+def gaussian_rings(count: int, rim: bool = False) -> tuple[Tensor, Tensor]:
+    """Return radii within the unit circle and the shares of its area that they stand for, (count,)
+    each: Gauss and Legendre's nodes in ρ², on which an area's element is even.
+
+    Polynomials in ρ² are exact up to the degree 2·count - 1.  With the rim, they are Radau's
+    (Golub, SIAM Rev. 15, 318, 1973), exact up to 2·count - 2.
+
+    Args:
+        count: of rings.
+        rim: whether the outermost one is the rim itself.
+    """
+    nodes, weights = _radau(count) if rim else np.polynomial.legendre.leggauss(count)
+    return torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0))), torch.from_numpy(0.5 * weights)
+
+
+def _radau(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes from -1 to 1, the last of them 1, and weights that sum to two."""
+    order = np.arange(1, count)
+    beside = order / np.sqrt(4.0 * order**2 - 1.0)
+    matrix = np.diag(beside, 1) + np.diag(beside, -1)
+    matrix[-1, -1] = count / (2.0 * count - 1.0)
+    node, vectors = np.linalg.eigh(matrix)
+    return node, 2.0 * vectors[0] ** 2
 
 
 def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:

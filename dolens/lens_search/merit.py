@@ -172,13 +172,11 @@ class SearchMerit:
         numbers = numbers_of(self.arrangement, u.unbind(-1), list(self.indices))
         return numbers, paraxial(self.arrangement, numbers)
 
-    def paraxial_of(self, u: Tensor) -> "tuple[Tensor, ...]":
-        """Return power, entrance pupil, back focus and Petzval sum of lenses u (L, P), times or
-        over f.
-        """
+    def paraxial_of(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return power, entrance pupil and back focus of lenses u (L, P), times or over f."""
         _, found = self.first_order(u)
         pupil = found.entrance_pupil + torch.zeros_like(found.power)
-        return found.power, pupil, found.back_focus, found.petzval
+        return found.power, pupil, found.back_focus
 
     def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
         """Return the models of lenses u (L, P), in units of f; no merit where a ray fails."""

@@ -7,12 +7,13 @@ dispatches every operation.  Lengths are in units of the focal length that is as
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import STOP, Arrangement
-from dolens.optics.paraxial import UNIT_RAYS, Number, TwoRays
+from dolens.lens_search.arrangement import Arrangement
+from dolens.optics.paraxial import UNIT_RAYS, Number, through_surfaces
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,6 @@ class Paraxial:
         marginal: heights on the S refracting surfaces of a ray parallel to the axis at height 1.
         chief: heights there of a ray of slope 1 through the middle of the stop.
         stop_height: height of the first of these rays at the stop.
-        petzval: Σ (n' - n)·c/(n·n'), (L,); 0 is a flat field, 1 that of a thin lens with n = 1.
     """
 
     power: Number
@@ -54,7 +54,6 @@ class Paraxial:
     marginal: Sequence[Number]
     chief: Sequence[Number]
     stop_height: Number
-    petzval: Number
 
 
 def numbers_of(
@@ -74,24 +73,18 @@ def numbers_of(
 
 def paraxial(arrangement: Arrangement, lenses: LensNumbers) -> Paraxial:
     """Trace two paraxial rays through L lenses (Welford, ch. 3)."""
-    rays = UNIT_RAYS
-    at_stop, back = rays, rays
-    met: list[TwoRays] = []
-    before = 0
-    petzval: Number = 0.0
-    last = len(arrangement.sequence) - 1
-    for place, number in enumerate(arrangement.sequence):
-        if number == STOP:
-            at_stop = rays
-        else:
-            met.append(rays)
-            index, behind = lenses.indices[before], lenses.indices[number + 1]
-            power = lenses.curvatures[number] * (behind - index)
-            petzval = petzval + power / (index * behind)
-            rays = TwoRays(rays.y, rays.y2, rays.nu - power * rays.y, rays.nu2 - power * rays.y2)
-            before, back = number + 1, rays
-        if place < last:
-            rays = rays.transferred(lenses.gaps[place], lenses.indices[before])
+    curvatures, gaps, indices = lenses.curvatures, lenses.gaps, lenses.indices
+    # Of the sequence, so many surfaces stand in front of the stop.
+    k = arrangement.stop_place
+    front = list(through_surfaces(UNIT_RAYS, curvatures[:k], gaps, indices))
+    at_stop = rays = front[-1] if front else UNIT_RAYS
+    if front:
+        at_stop = rays = rays.transferred(gaps[k - 1], indices[k])
+    if k < len(curvatures):
+        rays = rays.transferred(gaps[k], indices[k])
+    behind = list(through_surfaces(rays, curvatures[k:], gaps[k + 1 :], indices[k:]))
+    met = [*front, *behind]
+    back = met[-1]
     # Through the middle of the stop: y₁·A + slope·B = 0.
     height = -at_stop.y2 / at_stop.y
     return Paraxial(
@@ -101,7 +94,15 @@ def paraxial(arrangement: Arrangement, lenses: LensNumbers) -> Paraxial:
         marginal=[ray.y for ray in met],
         chief=[height * ray.y + ray.y2 for ray in met],
         stop_height=at_stop.y,
-        petzval=petzval,
+    )
+
+
+def petzval_sum(lenses: LensNumbers) -> Number:
+    """Return Σ (n' - n)·c/(n·n'), (L,); 0 is a flat field, 1 that of a thin lens with n = 1."""
+    media = pairwise(lenses.indices)
+    return sum(
+        c * (after - before) / (before * after)
+        for c, (before, after) in zip(lenses.curvatures, media, strict=True)
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.analysis.pupil_quadrature import gaussian_rings
 from dolens.lens_search.specification import Specification
 
 
@@ -79,31 +80,19 @@ def half_pupil(rings: int, arms: int, rim: bool = False) -> tuple[Tensor, Tensor
     """Return points of the half x ≥ 0 of the unit circle (N, 2) and weights that sum to one.
 
     Gaussian quadrature in r² (Forbes, J. Opt. Soc. Am. A 5, 1943, 1988): exact for even polynomials
-    of degree up to 4·rings - 2 in r, and of harmonics below 2·arms.  With the rim it is Radau's
-    (Golub, SIAM Rev. 15, 318, 1973), exact up to 4·rings - 4: polynomial surfaces can turn steeply
-    beyond the outermost ray.
+    of degree up to 4·rings - 2 in r, and of harmonics below 2·arms.  With the rim it is Radau's,
+    exact up to 4·rings - 4: polynomial surfaces can turn steeply beyond the outermost ray.
 
     Args:
         rings: radii.
         arms: azimuths of the half.
         rim: whether the outermost ring is the rim itself.
     """
-    node, weight = _radau(rings) if rim else np.polynomial.legendre.leggauss(rings)
-    radius = np.sqrt(0.5 * (node + 1.0))
+    radius, shares = gaussian_rings(rings, rim)
     azimuth = -0.5 * math.pi + (np.arange(arms) + 0.5) * math.pi / arms
-    points = radius[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
-    shares = np.repeat(0.5 * weight / arms, arms)
-    return torch.from_numpy(points.reshape(-1, 2)), torch.from_numpy(shares)
-
-
-def _radau(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes from -1 to 1, the last of them 1, and weights that sum to two."""
-    order = np.arange(1, count)
-    beside = order / np.sqrt(4.0 * order**2 - 1.0)
-    matrix = np.diag(beside, 1) + np.diag(beside, -1)
-    matrix[-1, -1] = count / (2.0 * count - 1.0)
-    node, vectors = np.linalg.eigh(matrix)
-    return node, 2.0 * vectors[0] ** 2
+    around = torch.from_numpy(np.stack([np.cos(azimuth), np.sin(azimuth)], -1))
+    points = radius[:, None, None] * around
+    return points.reshape(-1, 2), (shares / arms).repeat_interleave(arms)
 
 
 def search_rays(specification: Specification, rings: int = 4, arms: int = 8) -> SearchRays:

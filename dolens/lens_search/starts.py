@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dolens.lens_search.arrangement import AIR, Arrangement
 from dolens.lens_search.merit import SearchMerit
+from dolens.lens_search.paraxial import petzval_sum
 from dolens.lens_search.specification import Specification
 
 # Lenses that are drawn for one that is kept.
@@ -115,7 +116,7 @@ def _rank(merit: SearchMerit, lenses: Tensor) -> Tensor:
     numbers, found = merit.first_order(lenses)
     aperture = 0.5 / specification.f_number
     field = math.tan(math.radians(specification.fields[-1]))
-    strain = 4.0 * found.petzval.square() + (_COLOUR * merit.colour(lenses)).square()
+    strain = 4.0 * petzval_sum(numbers).square() + (_COLOUR * merit.colour(lenses)).square()
     good = torch.isfinite(lenses).all(-1)
     for curvature, marginal, chief in zip(
         numbers.curvatures, found.marginal, found.chief, strict=True

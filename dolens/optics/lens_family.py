@@ -21,7 +21,8 @@ from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import IndexMap, SurfaceTable, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
-from dolens.optics.rays import Rays, TracedRays, arrives
+from dolens.optics.ray_tracing import choose_backend, trace_rays
+from dolens.optics.rays import Components, Rays, TracedRays, arrives
 
 
 @dataclass(frozen=True)
@@ -435,3 +436,44 @@ def jacobian_parts(
 
 def _slices(count: int, size: int) -> Iterator[slice]:
     return (slice(first, min(first + size, count)) for first in range(0, count, size))
+
+
+def traced_lens(lens: Lens, names: Sequence[str], values: Tensor, rays: Rays) -> TracedRays:
+    """Trace rays through a lens with other parameters by the reference, which `torch.func` follows.
+
+    Args:
+        lens: any.
+        names: of P parameters, each a single number.
+        values: (P,), in the units of the parameters.
+        rays: N of them.
+    """
+    system = lens.system(dict(zip(names, values.unbind(), strict=True)))
+    return trace_rays(system.traced_by("reference"), rays)
+
+
+def trace_lenses(
+    lens: Lens, names: Sequence[str], values: Tensor, rays: Rays
+) -> tuple[Components, Tensor]:
+    """Trace the same rays through many lenses: a `LensFamily`, which the kernels trace by one call,
+    or where they do not serve a batch of `torch.func.vmap` over the reference.
+
+    Args:
+        lens: gives the structure, and all that is no variable; its `backend` says what traces.
+        names: of P parameters, each a single number.
+        values: (L, P), in the units of the parameters.
+        rays: N of them.
+
+    Returns:
+        The rays on the sensors and their statuses, (L, N).
+    """
+    if choose_backend(lens.system(), rays) != "reference":
+        wavelengths, shared = shared_rays(rays)
+        family = LensFamily(lens, names, wavelengths)
+        hit = family.trace(values, shared.of_each(len(values)))
+        return hit.components(), hit.status
+
+    def one(own: Tensor) -> tuple[Components, Tensor]:
+        hit = traced_lens(lens, names, own, rays)
+        return hit.components(), hit.status
+
+    return vmap(one)(values)

@@ -3,21 +3,17 @@
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import vmap
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.lens_family import LensFamily, shared_rays
-from dolens.optics.ray_tracing import choose_backend
-from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.lens_family import trace_lenses, traced_lens
+from dolens.optics.rays import Components, Rays, Status, arrives
 from dolens.optics.system import require_plane_sensor
-from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tasks import TaskMap
 from dolens.tolerancing.sensitivity import FocusCurves, check_whole_pupil
 
@@ -83,13 +79,13 @@ def trace_perturbed(
     nominal = {name: parameter.detach() for name, parameter in lens.variables(names).items()}
     start = torch.stack([nominal[name] for name in names])
     ray = Components(*(c.double() for c in spots.rays.components()))
-    wavelength = spots.rays.wavelength
+    rays = Rays.from_components(ray, spots.rays.wavelength)
     shares = spots.weight.new_zeros(len(spots.weight), spots.count)
     shares[torch.arange(len(spots.weight)), spots.spot] = spots.weight
     # Sums are formed about the design's centroids, so that squares of distances lose no digits.
-    design = _intercepts(_traced(lens, names, ray, wavelength, start).ray)
+    design = _intercepts(traced_lens(lens, names, start, rays).components())
     means = (torch.stack(design) @ shares)[:, spots.spot]
-    moments = _Moments(lens, tuple(names), ray, wavelength, shares, means, spots.weight)
+    moments = _Moments(lens, tuple(names), rays, shares, means, spots.weight)
     if chunk_size is None:
         chunk_size = max(1, RAYS_AT_A_TIME // len(spots.weight))
     # Copies: a part of a tensor brings all of it where a task runs in another process.
@@ -114,8 +110,7 @@ class _Moments:
     Attributes:
         lens: as designed.
         names: of P parameters.
-        ray: N of them.
-        wavelength: nm, theirs.
+        rays: N of them.
         shares: (N, S), what a ray adds to each spot.
         means: (4, N), what moments are about: x, y and tangents of each ray's spot.
         weight: (N,), of the rays in their spots.
@@ -123,8 +118,7 @@ class _Moments:
 
     lens: Lens
     names: tuple[str, ...]
-    ray: Components
-    wavelength: float | Tensor
+    rays: Rays
     shares: Tensor
     means: Tensor
     weight: Tensor
@@ -133,42 +127,13 @@ class _Moments:
     @torch.no_grad()
     def __call__(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return moments (K, 7, S), and shares of failed and vignetted rays (K,)."""
-        rays = Rays.from_components(self.ray, self.wavelength)
-        if choose_backend(self.lens.system(), rays) != "reference":
-            return self._moments(*self._by_kernels(values, rays))
-        return vmap(self._of_one)(values)
-
-    def _by_kernels(self, values: Tensor, rays: Rays) -> tuple[Components, Tensor, Tensor]:
-        """Return the rays of every lens (K, N) on its sensor, and which failed and were clipped."""
-        wavelengths, shared = shared_rays(rays)
-        family = LensFamily(self.lens, self.names, wavelengths)
-        hit = family.trace(values, shared.of_each(len(values)))
-        clipped = hit.status == int(Status.VIGNETTED)
-        return hit.components(), ~(hit.valid | clipped), clipped
-
-    def _of_one(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        trace = _traced(self.lens, self.names, self.ray, self.wavelength, values)
-        goes_on, inside = _smallest_margins(trace)
-        failed = ~(goes_on > 0.0)
-        return self._moments(trace.ray, failed, ~(inside > 0.0) & ~failed)
-
-    def _moments(
-        self, ray: Components, failed: Tensor, clipped: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return moments (..., 7, S) of rays (..., N), and shares (...)."""
+        ray, status = trace_lenses(self.lens, self.names, values, self.rays)
         pairs = zip(_intercepts(ray), self.means.unbind(), strict=True)
         x, y, u, v = (c - m for c, m in pairs)
         terms = [x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]
         sums = torch.stack(terms, -2) @ self.shares
-        lost = clipped.double() @ self.weight / self.shares.shape[1]
-        return sums, failed.double().mean(-1), lost
-
-
-def _traced(
-    lens: Lens, names: Sequence[str], ray: Components, wavelength: float | Tensor, values: Tensor
-) -> Trace:
-    system = lens.system(dict(zip(names, values.unbind(), strict=True)))
-    return trace_to_sensor(system, trace_surfaces(system, ray, wavelength), wavelength)
+        lost = (status == Status.VIGNETTED).double() @ self.weight / self.shares.shape[1]
+        return sums, (~arrives(status)).double().mean(-1), lost
 
 
 def _in_threads(
@@ -193,12 +158,3 @@ def _in_threads(
 def _intercepts(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the ray intercepts x and y on the sensor, mm, and the tangents l/n and m/n."""
     return ray.x, ray.y, ray.l / ray.n, ray.m / ray.n
-
-
-def _smallest_margins(trace: Trace) -> tuple[Tensor, Tensor]:
-    """Return the margins of what ends a ray, and of the apertures that clip it; positive where it
-    passes.
-    """
-    goes_on = [m for row in trace.margins for m in (row.met, row.transmitted) if m is not None]
-    inside = [row.inside for row in trace.margins if row.inside is not None]
-    return reduce(torch.minimum, goes_on), reduce(torch.minimum, inside)
