@@ -22,7 +22,7 @@ from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse
 from dolens.optics.surfaces.obscurations import Ring, Spider, Together
 from dolens.optics.surfaces.outlines import Point, Polygons
 from dolens.optics.system import OpticalSystem
-from dolens.plotting.section import sag_of
+from dolens.plotting.section import place_of
 
 AZIMUTHS = 64
 _ACROSS = 10
@@ -206,18 +206,20 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
 
 def _placed(system: OpticalSystem, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return points (..., 3) of a surface in the lens's axes, at x and y in its own."""
-    sag, _, _, _ = sag_of(system, number, torch.from_numpy(x), torch.from_numpy(y))
-    return _turned(system, number, np.stack([x, y, sag.numpy()], -1), True)
+    return _turned(system, number, np.stack([x, y, _sag(system, number, x, y)], -1), True)
 
 
 def _turned(system: OpticalSystem, number: int, vectors: np.ndarray, moved: bool) -> np.ndarray:
     """Return points (moved) or directions in a surface's axes in those of the lens."""
-    axes = system.axes[number - 1]
-    if axes.rotation is None:
-        return vectors + (np.array([0.0, 0.0, float(axes.z)]) if moved else 0.0)
-    turned = vectors @ axes.rotation.double().numpy().T
-    assert axes.origin is not None  # as there is a rotation
-    return turned + axes.origin.double().numpy() if moved else turned
+    rotation, origin = (part.numpy() for part in place_of(system, number))
+    turned = vectors @ rotation.T
+    return turned + origin if moved else turned
+
+
+def _sag(system: OpticalSystem, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the sag (mm) of a surface at points (mm) of its axes."""
+    surface = system.surfaces[number - 1]
+    return surface.sag_and_slopes(torch.from_numpy(x), torch.from_numpy(y))[0].numpy()
 
 
 def _edge(system: OpticalSystem, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -237,7 +239,8 @@ def _sheet_mesh(system: OpticalSystem, number: int, kind: str, sheet: Sheet) -> 
     """Return the part of a surface over a grid of points."""
     points, closed = sheet
     x, y = (np.ascontiguousarray(points[..., axis]) for axis in (0, 1))
-    _, sx, sy, _ = sag_of(system, number, torch.from_numpy(x), torch.from_numpy(y))
+    surface = system.surfaces[number - 1]
+    _, sx, sy, _ = surface.sag_and_slopes(torch.from_numpy(x), torch.from_numpy(y))
     normals = np.stack([-sx.numpy(), -sy.numpy(), np.ones_like(x)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     return _mesh(
@@ -285,12 +288,7 @@ def _sides(system: OpticalSystem, number: int, following: int) -> list[Mesh]:
     if together and round_faces and ratio > 1.0 + 1e-9:
         # The smaller face's rim, widened in its own plane.
         edge = edge_points(sizes[int(small == following)])
-        rim = np.zeros((AZIMUTHS, 3))
-        rim[:, :2] = edge
-        sag, _, _, _ = sag_of(
-            system, small, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
-        )
-        rim[:, 2] = sag.numpy()
+        rim = np.column_stack([edge, _sag(system, small, *edge.T)])
         wide = rim * np.array([ratio, ratio, 1.0])
         corner = _turned(system, small, wide, True)
         flat = _turned(system, small, rim, True)
@@ -346,10 +344,8 @@ def _stop(system: OpticalSystem) -> Mesh:
     largest = max(surface.semi_diameter for surface in system.surfaces)
     edge = center + around
     outer = center + around * (1.0 + 0.22 * largest / np.linalg.norm(around, axis=-1).max())
-    sag, _, _, _ = sag_of(
-        system, system.stop, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
-    )
-    rings = [np.concatenate([ring, sag.numpy()[:, None]], -1) for ring in (edge, outer)]
+    sag = _sag(system, system.stop, *edge.T)
+    rings = [np.column_stack([ring, sag]) for ring in (edge, outer)]
     return _mesh("stop", _turned(system, system.stop, np.stack(rings), True))
 
 
@@ -369,8 +365,7 @@ def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
     if image is not None:
         positions = np.linspace(0.0, 1.0, _RINGS)[:, None, None] * ring
         x, y = torch.from_numpy(positions[..., 0]), torch.from_numpy(positions[..., 1])
-        sag, _, _, _ = image.double().shape.sag_and_gradient(image.double().parameters, x, y)
-        positions[..., 2] = sag.numpy()
+        positions[..., 2] = image.sag_and_slopes(x, y)[0].numpy()
         return _mesh("sensor", positions @ rotation.T + origin)
     positions = positions @ rotation.T + origin
     return _mesh("sensor", positions, np.broadcast_to(-rotation[:, 2], positions.shape))

@@ -280,9 +280,8 @@ def _departure(surface: SurfaceState, curvature: float, height: Tensor) -> Tenso
     """
     reach = min(float(height), surface.semi_diameter)
     y = reach * torch.tensor(ZONES, dtype=torch.float64)
-    sag, _, _, exists = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(y), y)
-    real = torch.ones_like(y, dtype=torch.bool) if exists is None else exists > 0.0
-    return torch.where(real, departures(sag, torch.full_like(y, curvature), y), 0.0)
+    sag, _, _, exists = surface.sag_and_slopes(torch.zeros_like(y), y)
+    return torch.where(exists, departures(sag, torch.full_like(y, curvature), y), 0.0)
 
 
 def departures(sag: Tensor, curvature: Tensor, radius: Tensor) -> Tensor:

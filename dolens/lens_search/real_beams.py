@@ -151,7 +151,9 @@ def spaces(lens: Lens, heights: Tensor) -> tuple[Space, ...]:
         reach = [edges[n] for n in (first, last)]
         radii = torch.linspace(0.0, 1.0, RADII, dtype=torch.float64)
         radii = radii * (max(reach) if glass else min(reach))
-        front, back = (sag(lens, n, radii.clamp(max=float(heights[n - 1]))) for n in (first, last))
+        front, back = (
+            sag_and_slope(lens, n, radii.clamp(max=float(heights[n - 1])))[0] for n in (first, last)
+        )
         centre = vertices[last - 1] - vertices[first - 1]
         found.append(Space(first, last, glass, centre, float((centre + back - front).amin())))
     return tuple(found)
@@ -193,13 +195,8 @@ def _element_heights(lens: Lens, refracting: list[int], heights: Tensor) -> dict
     return found | {n: float(heights[n - 1]) for n in group}
 
 
-def sag(lens: Lens, number: int, radii: Tensor) -> Tensor:
-    """Return the sag of a surface, counted from 1, at radii (N,), mm."""
-    return sag_and_slope(lens, number, radii)[0]
-
-
 def sag_and_slope(lens: Lens, number: int, radii: Tensor) -> tuple[Tensor, Tensor]:
     """Return the sag of a surface, counted from 1, at radii (N,), mm, and its derivative."""
-    surface = lens.system().surfaces[number - 1].double()
-    found = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(radii), radii)
+    surface = lens.system().surfaces[number - 1]
+    found = surface.sag_and_slopes(torch.zeros_like(radii), radii)
     return found[0], found[2]

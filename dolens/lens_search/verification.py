@@ -17,7 +17,6 @@ from dolens.lens_search.real_beams import (
     RealBeams,
     Space,
     real_beams,
-    sag,
     sag_and_slope,
     spaces,
 )
@@ -233,7 +232,7 @@ def _back_focus(lens: Lens, beams: RealBeams) -> float:
     if lens.surfaces[str(last)].kind in _WITHOUT_TURNS:
         return distance
     radii = torch.linspace(0.0, 1.0, RADII, dtype=torch.float64) * beams.heights[last - 1]
-    return distance - float(sag(lens, last, radii).amax())
+    return distance - float(sag_and_slope(lens, last, radii)[0].amax())
 
 
 def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:

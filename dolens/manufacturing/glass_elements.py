@@ -19,7 +19,9 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Rectangle
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, require_refracting
+from dolens.plotting.section import place_of
 
 # Lengths that differ by less than this (mm) are the same to a workshop and to a solid modeller.
 SAME_LENGTH = 1e-6
@@ -69,10 +71,9 @@ class Face:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the sag (mm), its slopes, and whether the sag branch exists; all are finite."""
         points = (torch.as_tensor(v, dtype=torch.float64) for v in np.broadcast_arrays(x, y))
-        sag, sx, sy, margin = self.shape.sag_and_gradient(self.parameters, *points)
-        # The rim of a whole hemisphere is on the branch, and its margin has rounded.
-        exists = np.ones(sag.shape, bool) if margin is None else margin.numpy() >= -1e-12
-        return sag.numpy(), sx.numpy(), sy.numpy(), exists
+        surface = SurfaceState(self.shape, self.parameters, self.aperture)
+        sag, sx, sy, exists = surface.sag_and_slopes(*points)
+        return sag.numpy(), sx.numpy(), sy.numpy(), exists.numpy()
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return z (mm) of the ground face: the sag, and the flat ring beyond the semi-diameter."""
@@ -262,13 +263,8 @@ def glass_elements(lens: Lens) -> list[GlassElement]:
 
 def face_of(system: OpticalSystem, number: int) -> Face:
     """Return a surface of a system as a face, in double precision and where it lies."""
-    surface, axes = system.surfaces[number - 1], system.axes[number - 1]
-    if axes.rotation is None:
-        rotation, origin = np.eye(3), np.array([0.0, 0.0, float(torch.as_tensor(axes.z).detach())])
-    else:
-        assert axes.origin is not None  # as there is a rotation
-        rotation = axes.rotation.detach().double().cpu().numpy()
-        origin = axes.origin.detach().double().cpu().numpy()
+    surface = system.surfaces[number - 1]
+    rotation, origin = (part.numpy() for part in place_of(system, number))
     parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
     return Face(number, surface.shape, parameters, surface.aperture, rotation, origin)
 

@@ -83,6 +83,15 @@ class Axes(NamedTuple):
     origin: Tensor | None = None
     segment: int = 0
 
+    def place(self, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+        """Return rotation (3, 3) and origin (3,), mm, in double precision."""
+        if self.rotation is None:
+            z = torch.as_tensor(self.z, dtype=torch.float64, device=device)
+            zero = torch.zeros_like(z)
+            return torch.eye(3, dtype=z.dtype, device=device), torch.stack([zero, zero, z])
+        assert self.origin is not None  # as there is a rotation
+        return self.rotation.double(), self.origin.double()
+
     def together(self, other: "Axes") -> bool:
         """Return whether these axes and others lie along one line, and differ in z alone."""
         return self.elements == other.elements and self.segment == other.segment

@@ -171,18 +171,9 @@ class OpticalSystem:
 
     def global_axes(self) -> GlobalAxes:
         """Return vertex and rotation of every surface, and of the sensor, in the lens's axes."""
-        origins, rotations = [], []
-        for axes in self.all_axes:
-            like = torch.zeros((), dtype=torch.float64, device=self.device)
-            if axes.rotation is None:
-                origin = torch.stack([like, like, torch.as_tensor(axes.z).to(like)])
-                rotation = torch.eye(3, dtype=torch.float64, device=self.device)
-            else:
-                assert axes.origin is not None  # as there is a rotation
-                origin, rotation = axes.origin.double(), axes.rotation.double()
-            origins.append(origin)
-            rotations.append(rotation)
-        return GlobalAxes(torch.stack(origins), torch.stack(rotations))
+        places = (axes.place(self.device) for axes in self.all_axes)
+        rotations, origins = (torch.stack(part) for part in zip(*places, strict=True))
+        return GlobalAxes(origins, rotations)
 
     @property
     def dtype(self) -> torch.dtype:

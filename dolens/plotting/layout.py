@@ -25,7 +25,6 @@ from dolens.plotting.section import (
     broken_axis,
     element_edges,
     obscuration_profiles,
-    sag_of,
     sensor_curve,
     sensor_line,
     surface_profile,
@@ -169,16 +168,17 @@ def optics_text(
 
 def _depth(system: OpticalSystem, number: int) -> float:
     """Return the largest difference of sag along y, mm, in the surface's own axes."""
-    reach = system.surfaces[number - 1].semi_diameter
+    surface = system.surfaces[number - 1]
+    reach = surface.semi_diameter
     y = torch.linspace(-reach, reach, SAMPLES, dtype=torch.float64)
-    sag, _, _, exists = sag_of(system, number, torch.zeros_like(y), y)
+    sag, _, _, exists = surface.sag_and_slopes(torch.zeros_like(y), y)
     return float(np.ptp(sag[exists].numpy()))
 
 
 def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
     """Draw h(x, 0) and h(0, y) of a surface, in µm."""
-    semi_diameter = system.surfaces[number - 1].semi_diameter
-    t = torch.linspace(-semi_diameter, semi_diameter, SAMPLES, dtype=torch.float64)
+    surface = system.surfaces[number - 1]
+    t = torch.linspace(-surface.semi_diameter, surface.semi_diameter, SAMPLES, dtype=torch.float64)
     zero = torch.zeros_like(t)
     # The curves of x³ + y³ coincide: a thin one is drawn over a thick one.
     thick: dict[str, Any] = {"color": "#56B4E9", "linewidth": 3.0}
@@ -187,7 +187,7 @@ def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
         ("along x, h(x, 0)", t, zero, thick),
         ("along y, h(0, y)", zero, t, thin),
     ):
-        sag, _, _, exists = sag_of(system, number, x, y)
+        sag, _, _, exists = surface.sag_and_slopes(x, y)
         axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)
     axes.set_xlabel("x or y (mm)", fontsize=SMALL + 1)
     axes.set_ylabel(f"sag h of surface {number} (µm)", fontsize=SMALL + 1)

@@ -34,7 +34,7 @@ class SurfaceCut:
     """
 
     def __init__(self, system: OpticalSystem, number: int) -> None:
-        self.system, self.number = system, number
+        self.surface = system.surfaces[number - 1]
         self.rotation, self.origin = place_of(system, number)
         # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
         ax, ay, self.az = self.rotation[0]
@@ -61,11 +61,11 @@ class SurfaceCut:
         w = (-offset / across).expand_as(q)
         for _ in range(_NEWTON_STEPS if float(az.abs()) > 0.0 else 1):
             x, y = self.vx * q + self.ux * w, self.vy * q + self.uy * w
-            sag, sx, sy, _ = sag_of(self.system, self.number, x, y)
+            sag, sx, sy, _ = self.surface.sag_and_slopes(x, y)
             slope = across + az * (sx * self.ux + sy * self.uy)
             w = w - (across * w + offset + az * sag) / torch.where(slope == 0.0, across, slope)
         x, y = self.vx * q + self.ux * w, self.vy * q + self.uy * w
-        sag, _, _, exists = sag_of(self.system, self.number, x, y)
+        sag, _, _, exists = self.surface.sag_and_slopes(x, y)
         return x, y, sag, exists
 
     def profile(self, low: float, high: float) -> Profile:
@@ -95,25 +95,10 @@ def runs(inside: Callable[[Tensor], Tensor], reach: float) -> list[tuple[float, 
     return list(zip(rims[::2], rims[1::2], strict=False))
 
 
-def sag_of(
-    system: OpticalSystem, number: int, x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sag (mm) and slopes in double precision, and where they exist."""
-    surface = system.surfaces[number - 1]
-    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
-    sag, sx, sy, exists = surface.shape.sag_and_gradient(parameters, x, y)
-    exists = torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
-    return sag, sx, sy, exists
-
-
 def place_of(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
-    """Return rotation (3, 3) and origin (3,), mm, of a surface's axes."""
-    axes = system.axes[number - 1]
-    if axes.rotation is None:
-        z = float(axes.z)
-        return torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, z], dtype=torch.float64)
-    assert axes.origin is not None  # as there is a rotation
-    return axes.rotation.detach().double().cpu(), axes.origin.detach().double().cpu()
+    """Return rotation (3, 3) and origin (3,), mm, of a surface's axes, on the CPU."""
+    rotation, origin = system.axes[number - 1].place(system.device)
+    return rotation.detach().cpu(), origin.detach().cpu()
 
 
 # The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
@@ -368,11 +353,9 @@ def sensor_curve(system: OpticalSystem, half: float) -> np.ndarray:
     """
     if system.image is None:
         return sensor_line(system, half)
-    image = system.image.double()
-    y = torch.linspace(-half, half, _CURVE, dtype=torch.float64, device=system.device)
-    sag, _, _, exists = image.shape.sag_and_gradient(image.parameters, torch.zeros_like(y), y)
-    there = slice(None) if exists is None else exists > 0.0
-    local = torch.stack((torch.zeros_like(y), y, sag), -1)[there]
+    y = torch.linspace(-half, half, _CURVE, dtype=torch.float64)
+    sag, _, _, exists = system.image.sag_and_slopes(torch.zeros_like(y), y)
+    local = torch.stack((torch.zeros_like(y), y, sag), -1)[exists]
     axes = system.global_axes()
-    points = local @ axes.rotation[-1].mT + axes.origin[-1]
-    return points.detach().cpu().numpy()[:, [2, 1]]
+    rotation, origin = axes.rotation[-1].detach().cpu(), axes.origin[-1].detach().cpu()
+    return (local @ rotation.mT + origin).numpy()[:, [2, 1]]

@@ -56,6 +56,16 @@ class SurfaceState:
         parameters = {n: p.double() for n, p in self.parameters.items()}
         return replace(self, parameters=parameters, deflection=law)
 
+    def sag_and_slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the sag (mm) at points (mm), its slopes along x and y, and bool, where its branch
+        exists; in double precision on the CPU, all finite and without gradients.
+        """
+        parameters = {name: p.detach().double().cpu() for name, p in self.parameters.items()}
+        sag, sx, sy, margin = self.shape.sag_and_gradient(parameters, x, y)
+        # The rim of a whole hemisphere is on the branch, and its margin has rounded.
+        exists = torch.ones_like(sag, dtype=torch.bool) if margin is None else margin >= -1e-12
+        return sag, sx, sy, exists
+
     def rim_sag(self, like: Tensor) -> Tensor:
         """Return the sag (mm) at the aperture's reach along x, in another tensor's precision."""
         reach = torch.full_like(like, self.semi_diameter)
