@@ -1,109 +1,30 @@
-"""An index lists the photographs under a folder; what has not changed is not read again."""
+"""The photographs under a folder are listed, and what is known of their headers is kept.
 
+A file in the user's cache folder holds the names and what was found of the headers: arrays of
+numbers and text; nothing in it is executed.  A second start opens no photograph that was sound.
+"""
+
+import hashlib
+import io
+import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import Any, overload
 
 import numpy as np
 
 from dolens.errors import InputError
+from dolens.files import delete_old, user_cache_folder, write_whole
+from dolens.sensor.pictures import probe_picture
+from dolens.tasks import stage
 
 _log = logging.getLogger(__name__)
-
-# Seconds for which a file system may give two changes of a folder the same time.
-_SAME_TIME = 2.0
-
-
-class Listing(NamedTuple):
-    """A `Listing` is what a folder holds.
-
-    Attributes:
-        folder: path below the one that is walked; empty for that one itself.
-        stamp: times of its last change, ns, by which another change is noticed; empty where a
-            change would go unnoticed.
-        folders: names of the folders in it.
-        links: names of links in it that lead to no file; where they lead may change any time.
-        files: names of the wanted files in it; None: those known before.
-    """
-
-    folder: str
-    stamp: list[int]
-    folders: list[str]
-    links: list[str]
-    files: list[str] | None
-
-
-def walked(
-    root: Path, endings: tuple[str, ...], known: Mapping[str, Listing] | None = None
-) -> Iterator[Listing]:
-    """List a folder and all below it, each real folder once, in the order of their names.
-
-    Links to folders are followed.  Names that begin with a dot are left out.  A folder that cannot
-    be read is named in a warning.
-
-    Args:
-        root: the folder.
-        endings: of the wanted files, in lower case.
-        known: earlier listings; a folder whose stamp is still the same is not read again.
-    """
-    known = known or {}
-    waiting = [("", os.path.realpath(root))]
-    visited: set[str] = set()
-    while waiting:
-        folder, real = waiting.pop()
-        if real in visited:
-            continue
-        visited.add(real)
-        listing = _listed(root, folder, endings, known.get(folder))
-        yield listing
-        linked = {name for name in listing.links if (root / folder / name).is_dir()}
-        for name in sorted([*listing.folders, *linked], reverse=True):
-            path = os.path.join(folder, name)
-            of_link = os.path.realpath(root / path) if name in linked else None
-            waiting.append((path, of_link or os.path.join(real, name)))
-
-
-def _listed(root: Path, folder: str, endings: tuple[str, ...], known: Listing | None) -> Listing:
-    path = root / folder
-    try:
-        status = path.stat()  # before the folder is read, so that a change meanwhile is noticed
-        stamp = [status.st_mtime_ns, status.st_ctime_ns]
-        if known is not None and known.stamp == stamp:
-            return known._replace(files=None)
-        if max(stamp) > (time.time() - _SAME_TIME) * 1e9:
-            stamp = []
-        found = Listing(folder, stamp, [], [], [])
-        with os.scandir(path) as entries:
-            for entry in entries:
-                if not entry.name.startswith("."):
-                    _add(found, entry, endings)
-        return found
-    except OSError as error:
-        _log.warning("%s: cannot be read (%s); passed over", path, error.strerror or error)
-        return Listing(folder, [], [], [], [])
-
-
-def _add(found: Listing, entry: os.DirEntry[str], endings: tuple[str, ...]) -> None:
-    is_folder = _leads(entry.is_dir)
-    if entry.is_symlink() and not _leads(entry.is_file):
-        found.links.append(entry.name)
-    elif is_folder:
-        found.folders.append(entry.name)
-    if not is_folder and os.path.splitext(entry.name)[1].lower() in endings:
-        found.files.append(entry.name)
-
-
-def _leads(to: Callable[[], bool]) -> bool:
-    """Return whether an entry is what `to` asks for, which links in a circle are not."""
-    try:
-        return to()
-    except OSError:
-        return False
-
 
 # As names of files that are no UTF-8 reach Python.
 _ENCODING = ("utf-8", "surrogateescape")
@@ -155,24 +76,18 @@ UNSEEN, SOUND, REFUSED = 0, 1, 2
 
 @dataclass(frozen=True)
 class FolderIndex:
-    """A `FolderIndex` lists the photographs under a folder, sorted by their paths as text.
+    """A `FolderIndex` lists the photographs under a folder, in the order of their paths.
 
     Attributes:
         folder: all of them lie below it.
-        listings: of the folder and those below it, without their files' names.
         names: of the files, below the folder.
-        listing: number of the listing that each file stands in, int32.
-        order: numbers of the files in the order of their paths part by part, int32.
         header: UNSEEN, SOUND or REFUSED, uint8.
         size: of the file when its header was read, bytes, int64.
         modified: when it had last been written to then, ns, int64.
     """
 
     folder: Path
-    listings: tuple[Listing, ...]
     names: PackedNames
-    listing: np.ndarray
-    order: np.ndarray
     header: np.ndarray
     size: np.ndarray
     modified: np.ndarray
@@ -197,12 +112,6 @@ class FolderIndex:
         header = self.header.copy()
         header[list(numbers)] = UNSEEN
         return replace(self, header=header)
-
-    def ranks(self) -> np.ndarray:
-        """Return the place of each file in the order of paths part by part."""
-        ranks = np.empty(len(self), dtype=np.int64)
-        ranks[self.order] = np.arange(len(self))
-        return ranks
 
 
 class IndexedFiles(Sequence[Path]):
@@ -234,74 +143,238 @@ class IndexedFiles(Sequence[Path]):
         return self.index.recorded(int(self.numbers[place]))
 
 
-def check_folder(folder: Path, endings: tuple[str, ...]) -> None:
-    """Check that a folder is there.
+def listed(root: Path, endings: tuple[str, ...]) -> tuple[list[str], int]:
+    """Return the names of the files under a folder, in the order of their paths part by part, and
+    how many folders they lie in.
 
-    Raises:
-        InputError: it does not exist, or is no folder.
-    """
-    if not folder.is_dir():
-        state = "is not a folder" if folder.exists() else "does not exist"
-        raise InputError(
-            f"{folder}: {state}; allowed: a folder of images ending in {', '.join(endings)}"
-        )
-
-
-def index_of(
-    folder: Path, listings: Sequence[Listing], known: FolderIndex | None = None
-) -> FolderIndex:
-    """Make the index of a folder from its listings.
+    Links to folders are followed, each real folder once.  Names that begin with a dot are left out.
+    A folder that cannot be read is named in a warning.
 
     Args:
-        folder: the folder.
-        listings: of it and of all below; see `walked`.
-        known: the earlier index, from which come the names of the folders that are as they were,
-            and what was known of the files that are still there.
+        root: the folder.
+        endings: of the wanted files, in lower case.
     """
-    names: list[str] = []
-    earlier: list[np.ndarray] = [np.empty(0, dtype=np.int64)]
-    counts: list[int] = []
-    before = _files_by_listing(known)
-    for listing in listings:
-        old = before.get(listing.folder, {})
-        if listing.files is None:
-            found = list(old)
-        else:
-            found = [os.path.join(listing.folder, name) for name in listing.files]
-        names += found
-        counts.append(len(found))
-        earlier.append(np.array([old.get(name, -1) for name in found], dtype=np.int64))
-    by_text = np.array(sorted(range(len(names)), key=names.__getitem__), dtype=np.int64)
-    origin = np.concatenate(earlier)[by_text]
-    ordered = [names[number] for number in by_text]
-    parts = [name.replace(os.sep, "\0") for name in ordered]  # before all that names may hold
-    header = np.zeros(len(names), dtype=np.uint8)
-    size, modified = (np.zeros(len(names), dtype=np.int64) for _ in range(2))
-    if known is not None:
-        still = origin >= 0
-        for new, old_values in (
-            (header, known.header),
-            (size, known.size),
-            (modified, known.modified),
-        ):
-            new[still] = old_values[origin[still]]
-    return FolderIndex(
-        folder,
-        tuple(listing._replace(files=None) for listing in listings),
-        PackedNames.of(ordered),
-        np.repeat(np.arange(len(listings), dtype=np.int32), counts)[by_text],
-        np.array(sorted(range(len(parts)), key=parts.__getitem__), dtype=np.int32),
-        header,
-        size,
-        modified,
-    )
+    found: list[str] = []
+    waiting, visited = [""], set[str]()
+    while waiting:
+        folder = waiting.pop()
+        real = os.path.realpath(root / folder)
+        if real in visited:
+            continue
+        visited.add(real)
+        inner = []
+        before = os.path.join(folder, "")
+        try:
+            with os.scandir(root / folder) as entries:
+                for entry in entries:
+                    name = entry.name
+                    if name.startswith("."):
+                        continue
+                    if _is_folder(entry):
+                        inner.append(before + name)
+                    elif name.lower().endswith(endings):
+                        found.append(before + name)
+        except OSError as error:
+            _log.warning(
+                "%s: cannot be read (%s); passed over", root / folder, error.strerror or error
+            )
+        waiting += sorted(inner, reverse=True)
+    # A separator comes before all that names may hold.
+    return sorted(found, key=lambda name: name.replace(os.sep, "\0")), len(visited)
 
 
-def _files_by_listing(known: FolderIndex | None) -> dict[str, dict[str, int]]:
-    """Return the names of an index's files, each with its number, by the folder they lie in."""
-    if known is None:
-        return {}
-    found: list[dict[str, int]] = [{} for _ in known.listings]
-    for number, (name, listing) in enumerate(zip(known.names, known.listing.tolist(), strict=True)):
-        found[listing][name] = number
-    return {listing.folder: files for listing, files in zip(known.listings, found, strict=True)}
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # links in a circle
+        return False
+
+
+# Files from which on a folder is worth an index on disk: a smaller one is looked at in a moment.
+LEAST = 2000
+# What is known of headers, as arrays of numbers.
+_KNOWN = ("header", "size", "modified")
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+
+
+class IndexFile:
+    """The file in which the index of a folder is kept.
+
+    Args:
+        folder: whose index it is.
+        endings: of the photographs' files, in lower case.
+        kept: False: nothing is read or written.
+    """
+
+    def __init__(self, folder: Path, endings: tuple[str, ...], kept: bool = True) -> None:
+        self.folder, self.endings, self.kept = folder, endings, kept
+
+    @property
+    def path(self) -> Path:
+        """The file's path; it follows from the folder's and the endings."""
+        key = json.dumps([os.path.abspath(self.folder), self.endings])
+        digest = hashlib.sha256(key.encode()).hexdigest()[:32]
+        return user_cache_folder() / "folders" / f"{digest}.npz"
+
+    def index(self) -> FolderIndex:
+        """List the folder, and return its index with what the kept one knows of the files.
+
+        Raises:
+            InputError: the folder does not exist, is no folder, or holds no photograph.
+        """
+        endings = ", ".join(self.endings)
+        if not self.folder.is_dir():
+            state = "is not a folder" if self.folder.exists() else "does not exist"
+            raise InputError(
+                f"{self.folder}: {state}; allowed: a folder of images ending in {endings}"
+            )
+        started = time.perf_counter()
+        with stage(f"listing {self.folder}"):
+            names, folders = listed(self.folder, self.endings)
+            before = self._read() if self.kept else None
+        if not names:
+            raise InputError(
+                f"{self.folder}: no images in this folder; allowed: files ending in {endings}"
+            )
+        count = len(names)
+        index = FolderIndex(
+            self.folder,
+            PackedNames.of(names),
+            np.full(count, UNSEEN, dtype=np.uint8),
+            *(np.zeros(count, dtype=np.int64) for _ in range(2)),
+        )
+        known = 0
+        if before is not None:
+            numbers = {name: number for number, name in enumerate(before.names)}
+            origin = np.array([numbers.get(name, -1) for name in names], dtype=np.int64)
+            still = origin >= 0
+            known = int(still.sum())
+            for name in _KNOWN:
+                getattr(index, name)[still] = getattr(before, name)[origin[still]]
+        if known or count >= LEAST:
+            seconds = time.perf_counter() - started
+            _log.info(
+                "%s: %d photographs in %d folders, %d of them known from the index in the cache, "
+                "%.1f s",
+                *(self.folder, count, folders, known, seconds),
+            )
+        return index
+
+    def keep(self, index: FolderIndex) -> None:
+        """Write an index for the next start; where that fails, one line says so."""
+        if not self.kept or len(index) < LEAST:
+            return
+        content = io.BytesIO()
+        arrays = {name: getattr(index, name) for name in _KNOWN}
+        np.savez(content, names=index.names.text, **arrays)
+        try:
+            path = self.path
+            if not path.parent.is_dir():
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            delete_old(path.parent)
+            write_whole(path, content.getvalue())
+        except (OSError, RuntimeError) as error:  # no home folder
+            _log.warning("%s: the index cannot be kept for the next start: %s", self.folder, error)
+
+    def _read(self) -> FolderIndex | None:
+        """Read the kept index; None where there is none."""
+        try:
+            path = self.path
+            if not path.is_file():
+                return None
+            found = _index_in(path, self.folder)
+            os.utime(path)  # so that it is not deleted as forgotten
+            return found
+        except RuntimeError:
+            return None
+        except _DAMAGE as error:
+            line = str(error).partition("\n")[0]
+            _log.warning(
+                "%s: the index is damaged (%s), and made anew: %s", self.folder, line, path
+            )
+            return None
+
+
+def _index_in(path: Path, folder: Path) -> FolderIndex:
+    """Read an index, and check that its parts belong together."""
+    with np.load(path, allow_pickle=False) as content:
+        arrays: dict[str, Any] = {name: content[name] for name in _KNOWN}
+        names = PackedNames(content["names"])
+    shape = (len(names),)
+    if any(array.shape != shape or array.dtype.kind not in "iu" for array in arrays.values()):
+        raise ValueError("arrays of other lengths")
+    if len(names) and arrays["header"].max() > REFUSED:
+        raise ValueError("numbers out of range")
+    return FolderIndex(folder, names, **arrays)
+
+
+# Threads wait for disks, and for other machines' disks; they do not compute at once.
+_THREADS = 8
+# Files that a thread looks at in one go, and how often the log says how far it is, in seconds.
+_TOGETHER = 512
+_SAID_EVERY = 15.0
+
+
+def with_headers(
+    index: FolderIndex,
+    numbers: np.ndarray,
+    keep: Callable[[FolderIndex], None],
+    megapixels: float,
+) -> tuple[FolderIndex, dict[int, str]]:
+    """Read the headers of files that no header is known of, and of those that were refused.
+
+    Args:
+        index: of the files.
+        numbers: of those that count.
+        keep: is given an index that has learnt something; when reading is interrupted too, so that
+            the next start goes on from there.
+        megapixels: the largest photograph that is read, millions of pixels.
+
+    Returns:
+        The index with what was found, and why each refused file is refused.
+    """
+    wanted = numbers[index.header[numbers] != SOUND]
+    if not len(wanted):
+        return index, {}
+    found = replace(index, **{name: getattr(index, name).copy() for name in _KNOWN})
+    refused: dict[int, str] = {}
+
+    def look(some: np.ndarray) -> None:
+        for number in some.tolist():
+            path = index.folder / index.names[number]
+            # The status first: a file that changes meanwhile is noticed when it is used.
+            try:
+                status = os.stat(path)
+                found.size[number], found.modified[number] = status.st_size, status.st_mtime_ns
+            except OSError:
+                found.size[number] = found.modified[number] = -1
+            reason = probe_picture(path, megapixels)
+            found.header[number] = SOUND if reason is None else REFUSED
+            if reason is not None:
+                refused[number] = reason
+
+    pieces = [wanted[begin : begin + _TOGETHER] for begin in range(0, len(wanted), _TOGETHER)]
+    try:
+        with stage(f"reading the headers of {len(wanted)} photographs"):
+            _in_threads(look, pieces, len(wanted))
+    finally:
+        if any(not np.array_equal(getattr(found, name), getattr(index, name)) for name in _KNOWN):
+            keep(found)
+    return found, dict(sorted(refused.items()))
+
+
+def _in_threads(look: Callable[[np.ndarray], None], pieces: list[np.ndarray], total: int) -> None:
+    if len(pieces) == 1:
+        look(pieces[0])
+        return
+    said = time.perf_counter()
+    done = 0
+    pool = ThreadPoolExecutor(_THREADS)
+    try:
+        for piece, _ in zip(pieces, pool.map(look, pieces), strict=True):
+            done += len(piece)
+            if time.perf_counter() - said > _SAID_EVERY:
+                said = time.perf_counter()
+                _log.info("read the headers of %d of %d photographs", done, total)
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -17,8 +17,13 @@ from torch.nn.functional import max_pool2d
 
 from dolens.errors import InputError, check_choice
 from dolens.experiments.data.camera_data import CropDataModule, Split
-from dolens.experiments.data.folder_index import SOUND, FolderIndex, IndexedFiles
-from dolens.experiments.data.index_files import IndexFile, with_headers
+from dolens.experiments.data.folder_index import (
+    SOUND,
+    FolderIndex,
+    IndexedFiles,
+    IndexFile,
+    with_headers,
+)
 from dolens.experiments.data.photographs import (
     EXTENSIONS,
     FolderPhotographs,
@@ -58,8 +63,8 @@ class ImageFolderDataModule(CropDataModule):
             index remembers what was found, so that only the first start takes long.
         unreadable: `error` where a file cannot be decoded when its turn comes; `skip` takes the
             next readable file in its place, names it, and counts such files.
-        index: keep the list of the files in the user's cache folder, for the next start.  It is
-            checked against the times of the folders; small folders have none.
+        index: keep what is known of the files' headers in the user's cache folder, for the next
+            start; small folders have no index.
         cache_bytes: decoded pixels kept in memory, in each split and process.
         megapixels: the largest photograph that is read, millions of pixels; a larger one counts as
             unreadable, and is not decoded.
@@ -238,16 +243,16 @@ class ImageFolderDataModule(CropDataModule):
                 f"{self.root}: {len(files)} readable images for {len(bounds) + 1} splits; "
                 "allowed: at least one for each"
             )
-        values, ranks = self._hashes(files), files.index.ranks()[files.numbers]
-        hashed = np.lexsort((ranks, values))
+        values = self._hashes(files)
+        hashed = np.argsort(values, kind="stable")
         parts: list[IndexedFiles] = []
         begin = 0
         for position, bound in enumerate([*bounds, math.inf]):
             end = int((values < bound).sum())
             end = max(end, begin + 1)
             end = min(end, len(files) - (len(bounds) - position))
-            part = hashed[begin:end]
-            parts.append(IndexedFiles(files.index, files.numbers[part[np.argsort(ranks[part])]]))
+            numbers = np.sort(files.numbers[hashed[begin:end]])
+            parts.append(IndexedFiles(files.index, numbers))
             begin = end
         return parts
 
@@ -255,8 +260,7 @@ class ImageFolderDataModule(CropDataModule):
         if self.evaluation_limit is None or len(files) <= self.evaluation_limit:
             return files
         first = np.argsort(self._hashes(files), kind="stable")[: self.evaluation_limit]
-        numbers = files.numbers[first]
-        return IndexedFiles(files.index, numbers[np.argsort(files.index.ranks()[numbers])])
+        return IndexedFiles(files.index, np.sort(files.numbers[first]))
 
     def _hashes(self, files: IndexedFiles) -> np.ndarray:
         """Return a number in [0, 1) for each file, from the seed and its path below the root."""

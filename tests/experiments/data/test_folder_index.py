@@ -12,10 +12,9 @@ import pytest
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.experiments.data import folder_index, index_files
-from dolens.experiments.data.folder_index import PackedNames
+from dolens.experiments.data import folder_index
+from dolens.experiments.data.folder_index import IndexFile, PackedNames
 from dolens.experiments.data.image_folder import ImageFolderDataModule
-from dolens.experiments.data.index_files import IndexFile
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 14, 3), dtype=np.uint8)
 # Names whose order as text differs from that of their parts, and one that is no UTF-8.
@@ -27,11 +26,10 @@ NAMES = [
 
 @pytest.fixture
 def settled(monkeypatch, tmp_path):
-    """Every index is kept, in a folder of the test's own, and no change is too recent."""
+    """Every index is kept, in a folder of the test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(index_files, "user_cache_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(index_files, "LEAST", 1)
-    monkeypatch.setattr(folder_index, "_SAME_TIME", -60.0)
+    monkeypatch.setattr(folder_index, "user_cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(folder_index, "LEAST", 1)
 
 
 def image(path: Path, pixels: np.ndarray = PIXELS) -> Path:
@@ -86,14 +84,13 @@ def test_a_second_start_opens_no_file(settled, tmp_path, monkeypatch, caplog):
     first = split(data(root))
     opened = []
     monkeypatch.setattr(
-        index_files, "probe_picture", lambda path, _: opened.append(path) or "broken"
+        folder_index, "probe_picture", lambda path, _: opened.append(path) or "broken"
     )
-    monkeypatch.setattr(os, "scandir", None)
     with caplog.at_level(logging.INFO):
         again = data(root)
         assert split(again) == first
     assert opened == again.skipped_files == [root / "broken.png"]  # it may have been mended
-    assert "the index in the cache holds" in caplog.text
+    assert f"{len(NAMES) + 1} of them known from the index in the cache" in caplog.text
 
 
 def test_files_that_come_and_go_are_noticed(settled, tmp_path, monkeypatch, caplog):
@@ -102,26 +99,15 @@ def test_files_that_come_and_go_are_noticed(settled, tmp_path, monkeypatch, capl
     image(root / "n1" / "new.png")
     (root / NAMES[0]).unlink()
     image(root / "deep" / "er" / "new.png")
-    opened, probe = [], index_files.probe_picture
+    opened, probe = [], folder_index.probe_picture
     monkeypatch.setattr(
-        index_files, "probe_picture", lambda path, _: opened.append(path) or probe(path, 64)
+        folder_index, "probe_picture", lambda path, _: opened.append(path) or probe(path, 64)
     )
     with caplog.at_level(logging.INFO):
         found = split(data(root))
     assert sorted(opened) == [root / "deep/er/new.png", root / "n1/new.png"]
-    assert f"({len(NAMES)} files before)" in caplog.text
+    assert f"{len(NAMES) - 1} of them known" in caplog.text
     assert found == split(data(root, index=False))
-
-
-def test_a_folder_that_changed_just_now_is_read_again(settled, tmp_path, monkeypatch):
-    """File systems with coarse times would hide a second change."""
-    monkeypatch.setattr(folder_index, "_SAME_TIME", 60.0)
-    root = folder(tmp_path / "root")
-    split(data(root))
-    status = root.stat()
-    image(root / "late.png")
-    os.utime(root, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert root / "late.png" in [path for part in split(data(root)).values() for path in part]
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "other", "empty"])
@@ -145,7 +131,7 @@ def test_a_damaged_index_is_made_anew(settled, tmp_path, caplog, damage):
 
 def test_an_index_that_cannot_be_kept_costs_time_only(settled, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(index_files, "user_cache_folder", lambda: tmp_path / "file")
+    monkeypatch.setattr(folder_index, "user_cache_folder", lambda: tmp_path / "file")
     assert split(data(folder(tmp_path / "root")))
     assert "cannot be kept for the next start" in caplog.text
 
@@ -183,7 +169,7 @@ def test_a_pipe_is_not_waited_for(settled, tmp_path, caplog):
 
 def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatch):
     root = folder(tmp_path / "root")
-    probe, opened = index_files.probe_picture, []
+    probe, opened = folder_index.probe_picture, []
 
     def until_interrupted(path, megapixels):
         opened.append(path)
@@ -191,7 +177,7 @@ def test_an_interrupted_start_goes_on_where_it_was(settled, tmp_path, monkeypatc
             raise KeyboardInterrupt
         return probe(path, megapixels)
 
-    monkeypatch.setattr(index_files, "probe_picture", until_interrupted)
+    monkeypatch.setattr(folder_index, "probe_picture", until_interrupted)
     with pytest.raises(KeyboardInterrupt):
         split(data(root))
     split(data(root))
@@ -217,7 +203,7 @@ def test_a_picture_that_changed_is_noticed_when_it_is_opened(settled, tmp_path, 
 
 
 def test_small_folders_leave_nothing_in_the_cache(settled, tmp_path, monkeypatch):
-    monkeypatch.setattr(index_files, "LEAST", 2000)
+    monkeypatch.setattr(folder_index, "LEAST", 2000)
     split(data(folder(tmp_path / "root")))
     assert not (tmp_path / "cache").exists()
 

@@ -4,7 +4,7 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.experiments.data.index_files import IndexFile
+from dolens.experiments.data.folder_index import IndexFile
 from dolens.experiments.data.photographs import (
     EXTENSIONS,
     Photograph,
