@@ -1,1 +1,1 @@
-"""Parts of the independent check of a lens search: see `compare.py` and `retrace.py`."""
+"""Optiland's search of a task in plain numbers: the parts of scripts/search_by_others.py."""

@@ -1,4 +1,4 @@
-"""One of Optiland's global optimizers on a plain task; `optiland_on_merit.py` calls it.
+"""One of Optiland's global optimizers on a plain task; `search_by_others.py` calls it.
 
     PYTHON_WITH_OPTILAND scripts/lens_search/optiland_search.py --task TASK.json \
         --method BasinHopping --seconds 115 --seed 0 --out FOUND.json
@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from lens_search.budget import OutOfTime
-from lens_search.optiland_task_lens import Rays, built, deferred_places, values_of
-from lens_search.plain_task import Array, PlainTask
+from scripts.lens_search.optiland_lens import Rays, built, deferred_places, values_of
+from scripts.lens_search.plain_task import Array, PlainTask
 
 METHODS = ("DifferentialEvolution", "DualAnnealing", "BasinHopping", "CMAES", "ParticleSwarm")
 SEARCH = 0.9
@@ -33,6 +32,10 @@ SEARCH = 0.9
 _DRAWN, _HOP = 20, 0.1
 # Of a number whose square the merit sums.
 _MOST = 1e3
+
+
+class OutOfTime(Exception):
+    """The seconds are used up."""
 
 
 class Search:

@@ -1,8 +1,8 @@
 """The task of a search in plain numbers: bounds, rays and limits, without dolens.
 
-`on_merit.as_plain` writes them as JSON.  Variables are those of the search in mm: curvatures, gaps
-between neighbours of the sequence (refracting surfaces, and the stop as -1), the distance from the
-last of it to the sensor, and the coefficients of aspheres.  Deviations are those of
+`search_by_others.py` writes them as JSON.  Variables are those of the search in mm: curvatures,
+gaps between neighbours of the sequence (refracting surfaces, and the stop as -1), the distance from
+the last of it to the sensor, and the coefficients of aspheres.  Deviations are those of
 `dolens.lens_search.operands`, with the real heights of beams for paraxial ones: over the focal
 length, or relative.
 """
@@ -72,7 +72,7 @@ class Beams:
 
 @dataclass(frozen=True)
 class PlainTask:
-    """A task as `on_merit.as_plain` writes it; `data` is what the JSON holds."""
+    """A task as `search_by_others.py` writes it; `data` is what the JSON holds."""
 
     data: dict[str, Any]
 

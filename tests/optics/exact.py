@@ -122,11 +122,18 @@ def trace(lens, values, origin, direction, wavelength, near=None):
 
 
 def _indices(lens, wavelength):
-    """Before surface 1 and behind each; behind a mirror is the medium in front of it."""
+    """Before surface 1 and behind each; behind a mirror is the medium in front of it.
+
+    A glass of a catalogue has the index that dolens computes for it, in double precision.
+    """
     found = []
     for m in lens.materials:
-        mirror = m.name == "mirror"
-        found.append(found[-1] if mirror else mp.mpf(m.a) + mp.mpf(m.b) / mp.mpf(wavelength) ** 2)
+        if m.name == "mirror":
+            found.append(found[-1])
+        elif hasattr(m, "a"):
+            found.append(mp.mpf(m.a) + mp.mpf(m.b) / mp.mpf(wavelength) ** 2)
+        else:
+            found.append(mp.mpf(float(m.index(wavelength))))
     return found
 
 

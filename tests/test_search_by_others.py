@@ -1,37 +1,24 @@
-"""scripts/lens_search: a search's task in plain numbers against dolens, and the table of runs."""
+"""scripts/search_by_others.py: a task in plain numbers against dolens, and the table of runs."""
 
-import importlib
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from dolens.lens_search.starts import random_starts
+from scripts.lens_search.plain_task import Beams, PlainTask
+from scripts.search_by_others import Run, Task, kept, table
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 TASKS = [("search_triplet", 2), ("search_double_gauss", 2), ("search_phone", 0)]
 
 
-@pytest.fixture
-def part(monkeypatch):
-    """Return a function that imports a module of scripts/lens_search."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    before = set(sys.modules)
-    yield lambda name: importlib.import_module(f"lens_search.{name}")
-    for name in set(sys.modules) - before:
-        if name.startswith(("lens_search", "search_parts")):
-            del sys.modules[name]
-
-
 @pytest.fixture(params=TASKS, ids=[name for name, _ in TASKS])
-def both(part, request):
+def both(request):
     """Return the merit of a task, the same in plain numbers, and a random lens of both."""
-    of = part("on_merit").Task.of(*request.param)
+    of = Task.of(*request.param)
     data = json.loads(json.dumps(of.as_plain(5.0)))
-    plain = part("plain_task").PlainTask(data)
+    plain = PlainTask(data)
     u = random_starts(of.merit, 4, torch.Generator().manual_seed(1))[:1]
     if any(plain.terms):
         more = torch.linspace(-1.0, 1.0, sum(plain.terms), dtype=torch.float64)
@@ -56,7 +43,7 @@ def test_first_order_optics_is_that_of_dolens(both):
     assert distance == pytest.approx(f * pupil.item(), rel=1e-10, abs=1e-12)
 
 
-def test_limits_of_paraxial_beams_are_those_of_dolens(part, both):
+def test_limits_of_paraxial_beams_are_those_of_dolens(both):
     of, plain, u = both
     merit, f = of.merit, plain.focal_length
     _, found = merit.first_order(u)
@@ -64,7 +51,7 @@ def test_limits_of_paraxial_beams_are_those_of_dolens(part, both):
     rays = zip(found.marginal, found.chief, strict=True)
     heights = [abs(float(m)) * aperture + abs(float(c)) * tangent for m, c in rays]
     ideal = f * np.array(plain.chief_tangents)
-    beams = part("plain_task").Beams(
+    beams = Beams(
         plain.paraxial(plain.lens(u[0].numpy() * np.array(plain.scales)))[0],
         f * np.array(heights),
         f * abs(float(found.stop_height)) * aperture,
@@ -82,13 +69,13 @@ def test_limits_of_paraxial_beams_are_those_of_dolens(part, both):
     assert np.sort(own[1:paraxial]) == pytest.approx(np.sort(theirs[1:].numpy()), abs=1e-10)
 
 
-def test_distortion_and_angles_of_chief_rays_are_limited(part, both):
+def test_distortion_and_angles_of_chief_rays_are_limited(both):
     _, plain, u = both
     lens = plain.lens(u[0].numpy() * np.array(plain.scales))
     limits, ideal = plain.limits, plain.focal_length * np.array(plain.chief_tangents)
 
     def chief(heights, sines):
-        beams = part("plain_task").Beams(100.0, np.zeros(plain.surfaces), 0.0, heights, sines)
+        beams = Beams(100.0, np.zeros(plain.surfaces), 0.0, heights, sines)
         kinds = (limits["distortion"], limits["chief_ray_angle"])
         count = len(ideal) * sum(kind is not None for kind in kinds)
         return plain.deviations(lens, beams)[-count:]
@@ -102,13 +89,12 @@ def test_distortion_and_angles_of_chief_rays_are_limited(part, both):
         assert chief(ideal, steep)[-ideal.size :].min() > 0.01
 
 
-def test_runs_are_kept_and_tabled(part, tmp_path):
-    shared = part("on_merit")
+def test_runs_are_kept_and_tabled(tmp_path):
     for seed, spot in enumerate((10.92, None, 9.5)):
-        shared.Run("search_x", "a method", seed, 115.0, 1200, [0.5], spot).keep(tmp_path)
-    shared.Run("search_y", "a method", 0, 1.0, 1, None, None).keep(tmp_path)
-    runs = shared.kept(tmp_path, "search_x")
+        Run("search_x", "a method", seed, 115.0, 1200, [0.5], spot).keep(tmp_path)
+    Run("search_y", "a method", 0, 1.0, 1, None, None).keep(tmp_path)
+    runs = kept(tmp_path, "search_x")
     assert [run.seed for run in runs] == [0, 1, 2]
     assert runs[0].path(tmp_path).name == "search_x_a_method_0.json"
-    last = shared.table(runs).splitlines()[-1]
+    last = table(runs).splitlines()[-1]
     assert last == "| a method | 3 | 115 | 1.2e+03 | 10.92, none, 9.5 |"
