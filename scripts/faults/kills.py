@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dolens.files import UNFINISHED
-from scripts.tortures.processes import PATIENCE_S, Process, start, trust, write_slowly
-from scripts.tortures.run_folders import differences, faults_of, lost_rows
+from scripts.faults.processes import PATIENCE_S, Process, start, trust, write_slowly
+from scripts.faults.run_folders import differences, faults_of, lost_rows
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 _TRIES = 4  # more, where a run has ended before it was killed

@@ -1,11 +1,12 @@
 """Kill experiments, and take away what they need: what a checkpoint has must not be lost.
 
-    python scripts/torture.py kills --count 50    # of each kind
-    python scripts/torture.py kills --kind poses --count 5
-    python scripts/torture.py kills --folder F --minutes 5   # again and again, until all are done
-    python scripts/torture.py faults              # full disks and the like; some need root
+    python scripts/fault_injection.py kills --count 50    # of each kind
+    python scripts/fault_injection.py kills --kind poses --count 5
+    python scripts/fault_injection.py kills --folder F --minutes 5
+    python scripts/fault_injection.py faults              # full disks and the like; some need root
 
-The exit status is 1 where anything fell.  What fell is kept in the folder, with its logs.
+With --folder, kills go on where the last call stopped, until all are done.  The exit status is 1
+where anything fell.  What fell is kept in the folder, with its logs.
 """
 
 import argparse
@@ -18,10 +19,10 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch: forked processes have one thread
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from scripts.tortures.faults import FAULTS, done
-from scripts.tortures.kills import killed, table
-from scripts.tortures.kinds import KINDS
-from scripts.tortures.processes import warm_up
+from scripts.faults.faults import FAULTS, done
+from scripts.faults.kills import killed, table
+from scripts.faults.kinds import KINDS
+from scripts.faults.processes import warm_up
 
 
 def kill(options: argparse.Namespace, folder: Path) -> int:
@@ -64,7 +65,7 @@ def main() -> int:
     parser.add_argument("--fault", action="append", choices=list(FAULTS), help="that is done")
     parser.add_argument("--folder", type=Path, help="for the runs; else a temporary one")
     options = parser.parse_args()
-    folder = options.folder or Path(tempfile.mkdtemp(prefix="torture_"))
+    folder = options.folder or Path(tempfile.mkdtemp(prefix="faults_"))
     warm_up()
     print(f"runs in {folder}", flush=True)
     return (kill if options.what == "kills" else break_things)(options, folder)
