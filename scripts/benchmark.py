@@ -5,8 +5,9 @@ python scripts/benchmark.py                everything; about three quarters of a
 python scripts/benchmark.py --peers do=PATH deeplens=PATH optiland=PATH
                                            other programs beside ours; see docs/peers.md
 
-Writes outputs/benchmark/<date_time>/{results.csv,results.json,benchmark.png}.  Contenders run by
-turns on the same rays; numbers are medians with quartiles; ratios are of neighbouring runs.
+Writes outputs/benchmark/<date_time>/{results.csv,results.json}.  Contenders run by turns on the
+same rays; numbers are medians with quartiles; ratios are of neighbouring runs.  A singlet has two
+surfaces of one kind: `--parts trace --lenses singlet_q_con,singlet_toroid` compares kinds.
 """
 
 import argparse
@@ -18,18 +19,8 @@ from datetime import datetime
 from pathlib import Path
 
 import torch
-from benchmarks import (
-    aims,
-    figure,
-    jacobians,
-    memory,
-    peer_paths,
-    peers,
-    rendering,
-    starting,
-    tracing,
-)
-from benchmarks.cases import LENSES, ROOT
+from benchmarks import jacobians, memory, peer_paths, peers, rendering, starting, tracing
+from benchmarks.cases import LENSES, ROOT, SINGLETS
 from benchmarks.results import Results
 from benchmarks.tracing import FORWARD, GRADIENT, GRADIENT_OF_RAYS, Plan, compare
 
@@ -49,7 +40,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     text = f"other programs by path ({', '.join(words)}); of --parts those of peers alone"
     parser.add_argument("--peers", nargs="*", metavar="NAME=PATH", help=text)
     parser.add_argument("--rays", type=_list_of(lambda text: int(float(text))), help="1e4,1e5,...")
-    parser.add_argument("--lenses", type=many, help=", ".join(LENSES))
+    parser.add_argument("--lenses", type=many, help=", ".join((*LENSES, *SINGLETS)))
     parser.add_argument("--parts", type=many, help=", ".join((*PARTS, *peers.PARTS)))
     parser.add_argument("--dtypes", type=many, default=tuple(DTYPES), help=", ".join(DTYPES))
     parser.add_argument("--threads", type=many, default=("1", "all"), help="1,all")
@@ -65,7 +56,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     except InputError as error:
         parser.error(str(error))
     for chosen, known in (
-        (options.lenses, peers.LENSES if beside else LENSES),
+        (options.lenses, peers.LENSES if beside else (*LENSES, *SINGLETS)),
         (options.parts, (*PARTS, *peers.PARTS) if beside else PARTS),
         (options.dtypes, DTYPES),
     ):
@@ -113,11 +104,7 @@ def main(options: argparse.Namespace) -> int:
     if options.peers is not None:
         on_cpu = Plan(**vars(plan) | _on_cpu(threads))
         peers.measure(results, on_cpu, options.peers, options.parts, options.quick)
-    summary = aims.summarise(results.rows)
-    if set(options.parts) & set(PARTS):
-        aims.print_summary(summary)
-    results.write(summary)
-    figure.draw(results.rows, options.output / "benchmark.png")
+    results.write()
     failed = [row for row in results.rows if row.failed]
     for row in failed:
         print(f"without a result: {row.part}, {row.lens}, {row.backend} {row.dtype}: {row.note}")
@@ -137,7 +124,10 @@ def _measure(results: Results, plan: Plan, options: argparse.Namespace) -> None:
         tracing.measure(results, Plan(**vars(plan) | chosen), (GRADIENT_OF_RAYS,))
     if "b_spline" in parts:
         count = max(n for n in plan.rays if n <= 10**6 or n == min(plan.rays))
-        for part, title in ((FORWARD, aims.B_SPLINE), (GRADIENT, "B-spline forward and gradient")):
+        for part, title in (
+            (FORWARD, "B-spline forward"),
+            (GRADIENT, "B-spline forward and gradient"),
+        ):
             for dtype in plan.dtypes:
                 for threads in plan.threads:
                     torch.set_num_threads(threads)

@@ -27,6 +27,25 @@ CUBIC = 1e-4  # of the phase plate's x³ and y³, as in the reference rays
 # One freeform surface, to time it alone; 16×16 coefficients.
 _SPLINE_SIZE, _SPLINE_HALF_WIDTH = 16, 6.0
 HALF_FIELD["b_spline"] = 5.0
+_DISC = {"normalization_radius": 5.0}
+_WAVES = [[1e-4 * math.cos(0.7 * i) * math.sin(0.5 * j) for i in range(33)] for j in range(33)]
+# Biconvex lenses of two surfaces of a kind, to time that kind: shape of surface 1; surface 2 has
+# radii of opposite sign.
+SINGLETS: dict[str, dict] = {
+    "singlet_even_asphere": {"radius": 20.0, "conic": -0.5, "a4": 1e-6, "a6": 1e-9, "a8": 1e-11},
+    "singlet_sphere": {"radius": 20.0},
+    "singlet_odd_asphere": {"radius": 20.0, "conic": -0.5, "a3": 1e-5, "a4": 1e-6, "a5": 1e-8},
+    "singlet_biconic": {"radius_x": 20.0, "radius_y": 22.0, "conic_x": -0.5, "conic_y": 0.1},
+    "singlet_toroid": {"radius_x": 20.0, "radius_y": 22.0, "conic_y": 0.1, "a4": 1e-6},
+    "singlet_zernike_fringe": _DISC
+    | {"radius": 20.0, "z4": 1e-3, "z9": 1e-4, "z5": 2e-4, "z8": 1e-4},
+    "singlet_zernike_standard": _DISC
+    | {"radius": 20.0, **{f"z{j}": 1e-4 / j for j in range(4, 38)}},
+    "singlet_q_con": {"radius": 20.0, **{f"q{m}": 1e-3 / (m + 1) for m in range(6)}, **_DISC},
+    "singlet_q_bfs": {"radius": 20.0, **{f"q{m}": 1e-3 / (m + 1) for m in range(6)}, **_DISC},
+    "singlet_grid_sag": {"radius": 20.0, "sag": _WAVES, "spacing_x": 0.4, "spacing_y": 0.4},
+}
+HALF_FIELD |= dict.fromkeys(SINGLETS, 5.0)
 HALF_FIELD["asphere"] = 0.5
 
 
@@ -59,6 +78,8 @@ def load(name: str, dtype: torch.dtype, backend: str, device: torch.device) -> L
     """A lens of the benchmark."""
     if name == "b_spline":
         lens = lens_from_prescription(_spline_prescription(), dtype)
+    elif name in SINGLETS:
+        lens = lens_from_prescription(_singlet_prescription(name), dtype)
     else:
         lens = dolens.load_lens(ROOT / "conf" / "lens" / f"{name}.yaml", dtype=dtype)
     if name == "wavefront_coding":
@@ -101,6 +122,17 @@ def chunks(rays: Rays, size: int) -> Iterator[Rays]:
     """A bundle (N, 3) in pieces."""
     for first in range(0, rays.position.shape[0], size):
         yield part_of(rays, first, first + size)
+
+
+def _singlet_prescription(name: str) -> dict:
+    front = SINGLETS[name]
+    back = {key: -value if key.startswith("radius") else value for key, value in front.items()}
+    common = {"type": name.removeprefix("singlet_"), "semi_diameter": 5.0}
+    surfaces = {
+        "1": {**common, **front, "thickness": 3.0, "material": "1.5168/64.17"},
+        "2": {**common, **back, "material": "air"},
+    }
+    return {"name": name, "surfaces": surfaces, "stop": 1, "sensor": {"distance": 19.0}}
 
 
 def _spline_prescription() -> dict:

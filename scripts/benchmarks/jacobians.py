@@ -11,8 +11,10 @@ from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, by_turns
 from benchmarks.tracing import Plan, ratio_to, row_of_timing
 from dolens import Lens, Rays
+from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, traced_rays
 
+Function = Callable[[Lens, Rays, list[str]], Tensor]
 JACOBIAN, NORMAL_EQUATIONS = "Jacobian", "normal equations"
 LENS = "nikon"
 CURVED = (*range(1, 12), *range(13, 21))
@@ -79,33 +81,28 @@ def by_two_sweeps_normal(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
     return rows.T @ rows
 
 
-def library() -> dict[str, Callable[[Lens, Rays, list[str]], Tensor]] | str:
-    """The library's functions as tensors like the above; or why there are none."""
-    try:
-        from dolens.optics.jacobian import normal_equations, ray_jacobian
-    except ImportError as error:
-        return f"{error}"
-
-    def jacobian(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
-        return ray_jacobian(lens, rays, names).derivatives.movedim(-2, 0)
-
-    def normal(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
-        return normal_equations(lens, rays, names).jtj
-
-    return {JACOBIAN: jacobian, NORMAL_EQUATIONS: normal}
+# Part → plain PyTorch's function, and the library's.
+FUNCTIONS: dict[str, tuple[Function, Function]] = {
+    JACOBIAN: (
+        by_two_sweeps,
+        lambda lens, rays, names: ray_jacobian(lens, rays, names).derivatives.movedim(-2, 0),
+    ),
+    NORMAL_EQUATIONS: (
+        by_two_sweeps_normal,
+        lambda lens, rays, names: normal_equations(lens, rays, names).jtj,
+    ),
+}
 
 
 def measure(results: Results, plan: Plan) -> None:
     """Rows of milliseconds for the whole bundle, and relative errors by the norm."""
-    plain = {JACOBIAN: by_two_sweeps, NORMAL_EQUATIONS: by_two_sweeps_normal}
-    found = library()
-    for part in (JACOBIAN, NORMAL_EQUATIONS):
+    for part, (plain, _) in FUNCTIONS.items():
         exact = load(LENS, torch.float64, "reference", plan.device)
-        expected = plain[part](exact, launched_rays(exact), VARIABLES)
+        expected = plain(exact, launched_rays(exact), VARIABLES)
         for dtype in plan.dtypes:
             for threads in plan.threads:
                 torch.set_num_threads(threads)
-                _compare(results, plan, part, dtype, threads, expected, plain[part], found)
+                _compare(results, plan, part, dtype, threads, expected)
 
 
 def _compare(
@@ -115,30 +112,23 @@ def _compare(
     dtype: torch.dtype,
     threads: int,
     expected: Tensor,
-    plain: Callable[[Lens, Rays, list[str]], Tensor],
-    found: dict[str, Callable[[Lens, Rays, list[str]], Tensor]] | str,
 ) -> None:
+    plain, ours = FUNCTIONS[part]
     runs: dict[str, Callable[[], Tensor]] = {}
     case = None
     for backend in plan.backends:
         lens = load(LENS, dtype, backend, plan.device)
         rays = launched_rays(lens)
         case = case or Case(LENS, lens, Rays(rays.position.reshape(-1, 3), rays.direction))
-        if backend == "reference":
-            runs[backend] = lambda lens=lens, rays=rays: plain(lens, rays, VARIABLES)
-        elif not isinstance(found, str):
-            runs[backend] = lambda lens=lens, rays=rays: found[part](lens, rays, VARIABLES)
+        run = plain if backend == "reference" else ours
+        runs[backend] = lambda run=run, lens=lens, rays=rays: run(lens, rays, VARIABLES)
     timings = by_turns(
         [Contender(name, run) for name, run in runs.items()], plan.seconds, plan.device
     )
     for backend in plan.backends:
-        if backend not in timings:
-            row = Row(part, LENS, backend, dtype=str(dtype)[6:], threads=threads)
-            results.add(Row(**vars(row) | {"note": f"failed: {found}", "failed": True}))
-            continue
         timing = timings[backend]
         row = row_of_timing(part, case, backend, dtype, threads, case.count, timing, "")
-        row |= {key: row[key] * 1e-6 for key in ("value", "low", "high")} | {"unit": "ms"}
+        row |= timing.columns(1e3, "ms")
         if not timing.failure:
             error = (runs[backend]().detach().to(expected) - expected).norm() / expected.norm()
             row |= {"error": float(error), "error_unit": "relative"}

@@ -8,7 +8,7 @@ import torch
 
 import dolens
 from benchmarks.cases import ROOT, WAVELENGTH
-from benchmarks.peer_programs import optiland_optic, source_surface
+from benchmarks.peer_programs import optiland_optic, source_lens
 from dolens import Lens
 from dolens.optimize import MeritSettings
 
@@ -49,25 +49,6 @@ def _load(name: str, index_model: str) -> Lens:
     return dolens.load_lens(path, torch.float64, index_model, "cpu").requires_grad_(False)
 
 
-def _source_lens(lens: Lens):  # noqa: ANN202 - of another program
-    """A lens of ours as dO's, with its dispersion."""
-    import diffoptics
-
-    places = [float(z) for z in lens.system().vertices]
-    materials = []
-    for own in lens.materials:
-        material = diffoptics.Material("vacuum")
-        material.A, material.B = own.a, own.b
-        materials.append(material)
-    model = diffoptics.Lensgroup()
-    model.load(
-        [source_surface(s, z) for s, z in zip(lens.surfaces.values(), places[:-1], strict=True)],
-        materials,
-    )
-    model.d_sensor = places[-1]
-    return model
-
-
 def asphere() -> Problem:
     """dO's example `spherical_aberration`: Table I."""
     lens = _load("asphere", "do")
@@ -75,7 +56,7 @@ def asphere() -> Problem:
     def solve() -> dict[str, float]:
         import diffoptics
 
-        model = _source_lens(lens)
+        model = source_lens(lens)
         wavelength = torch.tensor([532.8])
 
         def points() -> torch.Tensor:
@@ -121,7 +102,7 @@ def nikon() -> Problem:
     def solve() -> dict[str, float]:
         import diffoptics
 
-        model = _source_lens(lens)
+        model = source_lens(lens)
         for place in (16, 17):
             model.surfaces[place].ai = torch.zeros(1)
         rays = [

@@ -6,7 +6,7 @@ they lie.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -61,19 +61,8 @@ class SourceProgram(Peer):
         import diffoptics
 
         self._program = diffoptics
-        places = [float(z.detach()) for z in lens.system().vertices]
-        surfaces = [
-            source_surface(surface, z)
-            for surface, z in zip(lens.surfaces.values(), places[:-1], strict=True)
-        ]
-        materials = []
-        for index in lens.system().indices(WAVELENGTH):
-            material = diffoptics.Material("vacuum")
-            material.A, material.B = float(index), 0.0
-            materials.append(material)
-        self.model = diffoptics.Lensgroup()
-        self.model.load(surfaces, materials)
-        self.model.d_sensor = places[-1]
+        indices = lens.system().indices(WAVELENGTH)
+        self.model = source_lens(lens, [(float(index), 0.0) for index in indices])
         numbers = list(lens.surfaces)
         self._curved = [(n, numbers.index(n)) for n, _ in _curved(lens)]
 
@@ -87,7 +76,26 @@ class SourceProgram(Peer):
         return self.model.trace_to_sensor(ray)[:, :2], leaves
 
 
-def source_surface(surface: Surface, z: float):  # noqa: ANN201 - of another program
+def source_lens(lens: Lens, dispersions: Sequence[tuple[float, float]] | None = None):  # noqa: ANN201
+    """A lens of ours as dO's, with the constants A and B of each medium, or with its own."""
+    import diffoptics
+
+    places = [float(z.detach()) for z in lens.system().vertices]
+    materials = []
+    for a, b in dispersions or [(own.a, own.b) for own in lens.materials]:
+        material = diffoptics.Material("vacuum")
+        material.A, material.B = a, b
+        materials.append(material)
+    model = diffoptics.Lensgroup()
+    model.load(
+        [_source_surface(s, z) for s, z in zip(lens.surfaces.values(), places[:-1], strict=True)],
+        materials,
+    )
+    model.d_sensor = places[-1]
+    return model
+
+
+def _source_surface(surface: Surface, z: float):  # noqa: ANN202 - of another program
     """A surface of ours at z (mm) as dO's."""
     import diffoptics
 

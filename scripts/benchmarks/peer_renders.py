@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cases import load
-from benchmarks.peer_programs import source_surface
+from benchmarks.peer_programs import source_lens
 from benchmarks.rendering import LENS, WIDTH_MM, texture
 from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, by_turns
@@ -38,25 +38,15 @@ class SourceRender:
     def __init__(self, lens: Lens, textures: Tensor) -> None:
         import diffoptics
 
-        places = [float(z.detach()) for z in lens.system().vertices]
-        materials = []
-        for own in lens.materials:
-            material = diffoptics.Material("vacuum")
-            material.A, material.B = own.a, own.b
-            materials.append(material)
-        surfaces = [
-            source_surface(surface, z)
-            for surface, z in zip(lens.surfaces.values(), places[:-1], strict=True)
-        ]
-        self._model = diffoptics.Lensgroup()
-        self._model.load(surfaces, materials)
-        self._model.d_sensor = torch.tensor(places[-1])
+        self._model = source_lens(lens)
+        sensor = self._model.d_sensor
+        self._model.d_sensor = torch.tensor(sensor)
         self._model.prepare_mts(WIDTH_MM / PIXELS, [PIXELS, PIXELS])
         texels = textures.shape[-1]
         scale = PlanarScene([DEPTH], WAVELENGTHS).magnifications(lens.system())[0]
         size = (texels - 1) * WIDTH_MM / PIXELS / scale
         # Behind the reversed lens, whose sensor is at 0; x down its rows, y along its columns.
-        place = np.array([0.0, 0.0, places[-1] + DEPTH])
+        place = np.array([0.0, 0.0, sensor + DEPTH])
         self._textures = [channel.flip(0).T.contiguous() for channel in textures[0]]
         self._screen = diffoptics.Screen(
             diffoptics.Transformation(np.eye(3), place), np.array([size, size]), self._textures[0]
@@ -119,7 +109,6 @@ def measure(results: Results, seconds: float, threads: int) -> None:
     for part, contenders in runs.items():
         timings = by_turns([Contender(k, run) for k, run in contenders.items()], seconds, _CPU)
         for name, timing in timings.items():
-            low, middle, high = (1e3 * value for value in timing.quartiles())
             row = Row(
                 part,
                 LENS,
@@ -127,13 +116,7 @@ def measure(results: Results, seconds: float, threads: int) -> None:
                 dtype="float32",
                 threads=threads,
                 rays=PIXELS**2 * SIDE**2 * len(WAVELENGTHS),
-                value=middle,
-                low=low,
-                high=high,
-                unit="ms",
-                runs=len(timing.seconds),
-                note=f"failed: {timing.failure}" if timing.failure else "",
-                failed=bool(timing.failure),
+                **timing.columns(1e3, "ms"),
             )
             if not timing.failure:
                 found = contenders[name]().double()

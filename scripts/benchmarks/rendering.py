@@ -85,7 +85,6 @@ def _compare(
     expected = quantities(exact, 1, textures.double())
     noise, _ = _difference(quantities(exact, 2, textures.double()), expected)
     for backend, timing in timings.items():
-        low, middle, high = (1e3 * value for value in timing.quartiles())
         row = {
             "part": part,
             "lens": LENS,
@@ -94,13 +93,7 @@ def _compare(
             "dtype": str(dtype)[6:],
             "threads": threads,
             "rays": pixels * pixels * SAMPLES**2 * 3,
-            "value": middle,
-            "low": low,
-            "high": high,
-            "unit": "ms",
-            "runs": len(timing.seconds),
-            "failed": bool(timing.failure),
-            "note": f"failed: {timing.failure}",
+            **timing.columns(1e3, "ms"),
         }
         if not timing.failure:
             error, where = _difference(quantities(lenses[backend], 1, textures), expected)

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -112,7 +111,7 @@ class Results:
             print(f"\n{row.part}\n{heading}")
         print("  ".join(text(row).ljust(width) for width, text in _LAYOUT.values()), flush=True)
 
-    def write(self, summary: list[Mapping[str, Any]]) -> None:
+    def write(self) -> None:
         """Write results.csv and results.json."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / "results.csv").open("w", newline="", encoding="utf-8") as file:
@@ -123,7 +122,7 @@ class Results:
             {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(r).items()}
             for r in self.rows
         ]
-        document = {"environment": self.environment, "rows": rows, "aims": summary}
+        document = {"environment": self.environment, "rows": rows}
         text = json.dumps(document, indent=1, allow_nan=False)
         (self.folder / "results.json").write_text(text + "\n", encoding="utf-8")
 

@@ -43,6 +43,19 @@ class Timing:
         """Lower quartile, median and upper quartile, seconds."""
         return quartiles(self.seconds)
 
+    def columns(self, scale: float, unit: str) -> dict[str, Any]:
+        """Return a row's columns of time in a unit, of which a second has so many."""
+        low, middle, high = (scale * value for value in self.quartiles())
+        return {
+            "value": middle,
+            "low": low,
+            "high": high,
+            "unit": unit,
+            "runs": len(self.seconds),
+            "note": f"failed: {self.failure}" if self.failure else "",
+            "failed": bool(self.failure),
+        }
+
     def ratio(self, other: "Timing") -> tuple[float, float, float]:
         """Quartiles of how many times longer the other takes, round by round."""
         return quartiles(other.seconds / self.seconds)

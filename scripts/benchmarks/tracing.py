@@ -133,7 +133,6 @@ def row_of_timing(
 ) -> dict:
     """A row's columns of time, ns per ray, or per ray and surface as the unit says."""
     scale = 1e9 / (case.surfaces if unit.endswith("surface") else 1)
-    low, middle, high = (scale * value for value in timing.quartiles())
     return {
         "part": part,
         "lens": case.name,
@@ -142,13 +141,7 @@ def row_of_timing(
         "dtype": str(dtype)[6:],
         "threads": threads,
         "rays": count,
-        "value": middle,
-        "low": low,
-        "high": high,
-        "unit": unit,
-        "runs": len(timing.seconds),
-        "note": f"failed: {timing.failure}" if timing.failure else "",
-        "failed": bool(timing.failure),
+        **timing.columns(scale, unit),
     }
 
 
