@@ -9,23 +9,33 @@ other programs on the machine do not count.
 """
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
+from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.camera.photograph_scores import format_interval
 from dolens.plotting import save_figure
-from dolens.plotting.runs import quality_figure
+from dolens.plotting.runs import Curve, quality_figure
 from dolens.reconstruction import Restoration
-from scripts.reconstruction.fixed_optics import FixedOptics, composed_network, fixed_optics
-from scripts.reconstruction.known_depth import known_depth
-from scripts.reconstruction.results import Result, curves, read, table, write
-from scripts.reconstruction.training import TrainedFor, restored, scores, train_for
+from dolens.reconstruction.quality import Interval, bootstrap_interval, gain_interval
+from scripts.fixed_optics import (
+    FixedOptics,
+    TrainedFor,
+    composed_network,
+    fixed_optics,
+    known_depth,
+    scores,
+    train_for,
+)
 
 # The lens that `experiment=wavefront_coding` learns with its default seed, before this comparison.
 LENS = (
@@ -64,6 +74,114 @@ ORACLE = "feature_wiener, depth known"
 BASELINE = "wiener_unet"
 
 
+@dataclass(frozen=True)
+class Result:
+    """A trained network and its scores.
+
+    Attributes:
+        name: of the network.
+        seed: of its training.
+        limit: process time that it was to train for, seconds.
+        seconds: that it did.
+        steps: of training.
+        parameters: their number.
+        scores: judge → PSNR in dB of photographs at depths, (P, D).
+    """
+
+    name: str
+    seed: int
+    limit: float
+    seconds: float
+    steps: int
+    parameters: int
+    scores: dict[str, Tensor]
+
+
+def write(result: Result, file: Path) -> None:
+    """Write a result as JSON."""
+    values = {**vars(result), "scores": {k: v.tolist() for k, v in result.scores.items()}}
+    file.write_text(json.dumps(values), encoding="utf-8")
+
+
+def read(folder: Path) -> list[Result]:
+    """Return all results of a folder."""
+    found = []
+    for file in sorted(folder.glob("*.json")):
+        values = json.loads(file.read_text(encoding="utf-8"))
+        values["scores"] = {k: torch.tensor(v) for k, v in values["scores"].items()}
+        found.append(Result(**values))
+    return found
+
+
+def table(results: Sequence[Result], baseline: str) -> list[str]:
+    """Return lines of Markdown: PSNR at the worst depth, and gains over the baseline."""
+    judges = list(results[0].scores)
+    lines = [
+        f"| network | seconds | ms a step | parameters | seeds | {' | '.join(judges)} | gain |",
+        "|" + "---|" * (6 + len(judges)),
+    ]
+    for limit in sorted({r.limit for r in results}):
+        groups = _groups(results, limit)
+        for name, by_seed in sorted(groups.items(), key=lambda g: _worst_of(g[1], judges[-1])):
+            one = next(iter(by_seed.values()))
+            worst = [f"{_worst_of(by_seed, judge):.2f}" for judge in judges]
+            gain = ""
+            if name != baseline and baseline in groups:
+                gain = format_interval(_gain(by_seed, groups[baseline], judges[-1]), 2)
+            lines.append(
+                f"| {name} | {limit:g} | {1000 * one.seconds / one.steps:.0f} | {one.parameters} "
+                f"| {len(by_seed)} | {' | '.join(worst)} | {gain} |"
+            )
+    return lines
+
+
+def curves(results: Sequence[Result]) -> list[Curve]:
+    """Return PSNR at the worst depth against seconds, by network, for the last judge."""
+    judge = list(results[0].scores)[-1]
+    found: dict[str, list[tuple[float, Interval]]] = {}
+    for limit in sorted({r.limit for r in results}):
+        for name, by_seed in _groups(results, limit).items():
+            scores = torch.stack([r.scores[judge] for r in by_seed.values()])
+            generator = torch.Generator().manual_seed(0)
+            interval = bootstrap_interval(scores, _worst, generator)
+            found.setdefault(name, []).append((limit, interval))
+    return [
+        Curve(
+            name,
+            [limit for limit, _ in points],
+            [i.estimate for _, i in points],
+            [i.low for _, i in points],
+            [i.high for _, i in points],
+        )
+        for name, points in found.items()
+    ]
+
+
+def _groups(results: Sequence[Result], limit: float) -> dict[str, dict[int, Result]]:
+    found: dict[str, dict[int, Result]] = {}
+    for result in results:
+        if result.limit == limit:
+            found.setdefault(result.name, {})[result.seed] = result
+    return found
+
+
+def _worst(means: Tensor) -> Tensor:
+    return means.amin(dim=-1)
+
+
+def _worst_of(by_seed: dict[int, Result], judge: str) -> float:
+    scores = torch.stack([r.scores[judge] for r in by_seed.values()])
+    return float(_worst(scores.mean(1)).mean())
+
+
+def _gain(by_seed: dict[int, Result], against: dict[int, Result], judge: str) -> Interval:
+    seeds = sorted(by_seed.keys() & against.keys())
+    ours, theirs = (
+        torch.stack([group[seed].scores[judge] for seed in seeds]) for group in (by_seed, against)
+    )
+    return gain_interval(ours, theirs, _worst, torch.Generator().manual_seed(0))
+
+
 def images(folder: Path, package_folders: Sequence[str]) -> dict[str, FixedOptics]:
     """Return the lens's images of the default's photographs, and of 42 others if they are there."""
     found = {"photos": fixed_optics(folder / "photos.pt", EXPERIMENT)}
@@ -95,7 +213,6 @@ def train(
                 done = train_for(maker(name), optics["photos"], limit, seed)
                 result = _judged(name, seed, limit, done, optics)
                 write(result, file)
-                torch.save(done.network.state_dict(), file.with_suffix(".weights"))
                 worst = {k: f"{v.mean(0).min():.2f}" for k, v in result.scores.items()}
                 print(f"{name}, seed {seed}: {done.steps} steps, {done.seconds:.0f} s, {worst}")
 
@@ -113,32 +230,6 @@ def _judged(
     return Result(name, seed, limit, done.seconds, done.steps, parameters, found)
 
 
-def pictures(folder: Path, file: Path, judge: str, crops: Sequence[int]) -> None:
-    """Write a PNG of restored crops: truth, raw, and every trained network of the first seed."""
-    from PIL import Image
-
-    optics = images(folder, [])[judge]
-    results = [r for r in read(folder) if r.seed == 0]
-    longest = max(r.limit for r in results)
-    rows = []
-    for crop in crops:
-        split = optics.splits["test"]
-        row = [split.truth[crop].float(), optics.raw(split.images[crop], 0)[0].clamp(0, 1) ** 0.45]
-        for result in (r for r in results if r.limit == longest and r.name in _SHOWN):
-            network = maker(result.name)()
-            stem = f"{result.name.replace(', ', '_').replace(' ', '_')}_{result.limit:g}_0"
-            weights = torch.load(folder / f"{stem}.weights", weights_only=True)
-            network.load_state_dict(weights)
-            row.append(restored(network.eval(), optics, "test", crop)[0])
-        rows.append(torch.cat(row, dim=-1))
-    array = (torch.cat(rows, dim=-2).permute(1, 2, 0) * 255).round().byte().numpy()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(array).save(file)
-
-
-_SHOWN = (BASELINE, "wiener_nafnet", "unrolled_splitting", "feature_wiener")
-
-
 def main(arguments: Sequence[str]) -> int:
     """Make images, train, or show a table and a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -152,9 +243,6 @@ def main(arguments: Sequence[str]) -> int:
     training.add_argument("--seeds", nargs="+", type=int, default=[0])
     show = commands.add_parser("show", help="a table, and a figure")
     show.add_argument("--figure", type=Path)
-    show.add_argument("--pictures", type=Path)
-    show.add_argument("--crops", nargs="+", type=int, default=[0, 1, 2, 3])
-    show.add_argument("--judge", default="packages", choices=["photos", "packages"])
     for part in (making, training, show):
         part.add_argument("--folder", type=Path, default=Path("outputs/reconstruction"))
     given = parser.parse_args(arguments)
@@ -169,8 +257,6 @@ def main(arguments: Sequence[str]) -> int:
             print("\n".join(table(found, BASELINE)))
             if given.figure:
                 save_figure(quality_figure(curves(found)), given.figure)
-            if given.pictures:
-                pictures(given.folder, given.pictures, given.judge, given.crops)
     except InputError as problem:
         parser.error(str(problem))
     return 0

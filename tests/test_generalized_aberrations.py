@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from scripts.co_design.cases import CASES
+from scripts.co_design.cases import CASES, METHODS, THEIRS
 from scripts.co_design.generalized_aberrations import GeneralizedAberrations, residuals
-from scripts.co_design.methods import METHODS, THEIRS
 from scripts.co_design.results import against
 from scripts.co_design.training import Trainings, _fit, _steps
 

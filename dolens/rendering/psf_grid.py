@@ -6,6 +6,9 @@ calibration of its distortion.  What the lens does besides is in the functions: 
 colour, and coma's shift.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import torch
@@ -34,6 +37,21 @@ from dolens.rendering.sampling import random_words, square_to_disc, stratified_s
 
 # Strata of the pupil along each side, for the light of a function that rays do not make.
 _LIGHT_SAMPLES = 32
+# Points and size of functions → the points to take instead.
+Watch = Callable[[PlanePoints, int], PlanePoints]
+_watch: ContextVar[Watch | None] = ContextVar("watch", default=None)
+
+
+@contextmanager
+def watched_points(watch: Watch) -> Iterator[None]:
+    """Let a function see where rays meet the planes, from the centres of functions and with their
+    size in pixels, before light is put there; the points that it returns are taken instead.
+    """
+    token = _watch.set(watch)
+    try:
+        yield
+    finally:
+        _watch.reset(token)
 
 
 class FieldPointSpreadFunctions(NamedTuple):
@@ -107,6 +125,8 @@ def field_point_spread_functions(
 
 def splat_plane_points(seen: PlanePoints, size: int, fused: bool) -> FieldPointSpreadFunctions:
     """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
+    watch = _watch.get()
+    seen = seen if watch is None else watch(seen, size)
     middle = size // 2
     # A pixel sees the point at +e: seen from there, the pixel is at -e.
     rows, columns = middle - seen.rows, middle - seen.columns

@@ -17,8 +17,6 @@ the spots' centroids; as many of them count as rays were drawn.
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import lightning
@@ -29,8 +27,8 @@ from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.camera.made_lenses import restored_in_parts, training_images
 from dolens.optimize.operands import UnreachableField
 from dolens.optimize.trust_region_step import ray_moves
-from dolens.rendering import psf_grid
 from dolens.rendering.plane_points import PlanePoints
+from dolens.rendering.psf_grid import watched_points
 
 # Of variables that undo one another, in the rows of J.
 _REGULAR = 1e-12
@@ -45,27 +43,6 @@ class _Rays(NamedTuple):
     leaf: Tensor
     weight: Tensor
     size: int
-
-
-@contextmanager
-def watched_points(found: list[_Rays]) -> Iterator[None]:
-    """Cut the graph where rays meet the scene, and append what was cut to a list."""
-    splat = psf_grid.splat_plane_points
-
-    def cut(seen: PlanePoints, size: int, fused: bool) -> psf_grid.FieldPointSpreadFunctions:
-        if not (torch.is_grad_enabled() and seen.rows.requires_grad):
-            return splat(seen, size, fused)
-        points = torch.stack(torch.broadcast_tensors(seen.rows, seen.columns))
-        leaf = points.detach().requires_grad_()
-        weight = seen.weight.detach()
-        found.append(_Rays(points, leaf, weight.expand(seen.rows.shape), size))
-        return splat(PlanePoints(leaf[0], leaf[1], weight), size, fused)
-
-    psf_grid.splat_plane_points = cut  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        psf_grid.splat_plane_points = splat
 
 
 def residuals(
@@ -119,9 +96,19 @@ class GeneralizedAberrations(lightning.Callback):
         self.increase, self.decrease, self.memory = increase, decrease, memory
         self.taken = 0
         self._found: list[_Rays] = []
-        self._watching = watched_points(self._found)
+        self._watching = watched_points(self._cut)
         self._batch: tuple[Tensor, int] | None = None
         self._loss, self._columns = math.nan, None
+
+    def _cut(self, seen: PlanePoints, size: int) -> PlanePoints:
+        """Cut the graph where rays meet the scene, and remember what was cut."""
+        if not (torch.is_grad_enabled() and seen.rows.requires_grad):
+            return seen
+        points = torch.stack(torch.broadcast_tensors(seen.rows, seen.columns))
+        leaf = points.detach().requires_grad_()
+        weight = seen.weight.detach()
+        self._found.append(_Rays(points, leaf, weight.expand(seen.rows.shape), size))
+        return PlanePoints(leaf[0], leaf[1], weight)
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         """Begin to watch where rays meet the scene, and keep the graph from there to the lens."""

@@ -108,11 +108,6 @@ class Trainings:
             return module, instantiate(settings.data), cfg.score
 
 
-def file_of(name: str, method: str, rest: str) -> str:
-    """Return the name of a training's file."""
-    return f"{name}_{method}_{rest}.json".replace(", ", "_").replace(" ", "_")
-
-
 def photographs_in(folders: Sequence[str]) -> list[str]:
     """Return overrides that choose the package photographs, with folders where they lie too."""
     found = ["data=package_photographs", "data.evaluation_crops_per_photograph=1"]
