@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.prescriptions.zemax_samples import lens_of, triplet
+from tests.prescriptions.zemax.samples import lens_of, triplet
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 

@@ -18,11 +18,11 @@ from dolens.lens_search.specification import Specification
 from dolens.optimize import MeritSettings
 from dolens.prescriptions.lens_formats import read_lens
 from dolens.scene.planar import PlanarScene
-from tests.prescriptions.codev_samples import TRIPLET as CODE_V
+from tests.prescriptions.codev.samples import TRIPLET as CODE_V
 from tests.prescriptions.samples import SINGLET
 from tests.prescriptions.test_completeness import PEERS
 from tests.prescriptions.test_oslo import TRIPLET as OSLO
-from tests.prescriptions.zemax_samples import triplet as zemax
+from tests.prescriptions.zemax.samples import triplet as zemax
 
 AXIS = torch.zeros(1, 2, dtype=torch.float64)
 START, AHEAD = torch.tensor([[[0.0, 0.0, -1.0]], [[0.0, 0.0, 1.0]]]).double()

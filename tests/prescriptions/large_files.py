@@ -7,10 +7,10 @@ name a number of which a reader must not make as many things.
 import json
 from collections.abc import Callable
 
-from tests.prescriptions import zemax_samples
-from tests.prescriptions.codev_samples import TRIPLET as CODE_V
+from tests.prescriptions.codev.samples import TRIPLET as CODE_V
 from tests.prescriptions.test_json_lenses import DEEPLENS, RAY_OPTICS
 from tests.prescriptions.test_oslo import TRIPLET as OSLO
+from tests.prescriptions.zemax import samples as zemax_samples
 
 ZEMAX = zemax_samples.triplet()
 ROW = "{type: sphere, radius: 50, semi_diameter: 5, thickness: 1, material: 1.5168/64.17}"

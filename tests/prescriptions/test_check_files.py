@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from dolens import InputError
 from dolens.cli.app import app
 from dolens.prescriptions.files import check_file, lens_files, summary
-from tests.prescriptions.zemax_samples import GLASS, singlet, triplet
+from tests.prescriptions.zemax.samples import GLASS, singlet, triplet
 
 GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
 

@@ -13,7 +13,7 @@ from dolens.prescriptions import load_prescription
 from dolens.prescriptions.conversion import converted
 from dolens.prescriptions.files import decode_prescription
 from tests.prescriptions.samples import SINGLET
-from tests.prescriptions.zemax_samples import HEAD, TAIL, TRIPLET, standard, surface
+from tests.prescriptions.zemax.samples import HEAD, TAIL, TRIPLET, standard, surface
 
 
 def with_row(n="1", **keys):

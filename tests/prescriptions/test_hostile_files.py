@@ -11,11 +11,11 @@ from dolens.optics.glass_catalog import glass_folders
 from dolens.prescriptions.files import find_lens
 from dolens.prescriptions.plain_values import plain_values
 from scripts.fuzz_lens_files import outcome
-from tests.prescriptions.codev_samples import TRIPLET as CODE_V
+from tests.prescriptions.codev.samples import TRIPLET as CODE_V
 from tests.prescriptions.mutations import mutated
 from tests.prescriptions.samples import require_refused
 from tests.prescriptions.test_oslo import TRIPLET as OSLO
-from tests.prescriptions.zemax_samples import triplet
+from tests.prescriptions.zemax.samples import triplet
 
 LENS = """surfaces:
   1: {{type: {kind}, radius: {radius}, semi_diameter: 5, thickness: 4, material: {material}{more}}}

@@ -5,7 +5,7 @@ import torch
 
 from dolens import load_lens
 from dolens.prescriptions.oslo import read_oslo
-from tests.prescriptions.codev_samples import TRIPLET as CODE_V_TRIPLET
+from tests.prescriptions.codev.samples import TRIPLET as CODE_V_TRIPLET
 from tests.prescriptions.samples import require_refused
 
 # The supplement's triplet, as OSLO writes.

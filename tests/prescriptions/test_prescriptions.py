@@ -9,8 +9,8 @@ import torch
 import yaml
 
 from dolens import InputError, load_lens, save_lens
-from dolens.prescriptions import lens_from_prescription, prescription_of
-from tests.prescriptions.samples import SINGLET
+from dolens.prescriptions import lens_from_prescription
+from tests.prescriptions.samples import SINGLET, require_refused
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
 
@@ -21,58 +21,12 @@ def test_there_are_lenses():
     }
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
-def test_every_lens_comes_back_to_the_last_bit(path, dtype, tmp_path):
-    lens = load_lens(path, dtype)
-    generator = torch.Generator().manual_seed(11)
-    for changed in (False, True):
-        if changed:
-            # Numbers without a short decimal form, as an optimizer leaves them.
-            with torch.no_grad():
-                for p in lens.parameters():
-                    p *= 1.0 + 1e-3 * torch.rand((), generator=generator, dtype=dtype)
-        save_lens(lens, tmp_path / "lens.yaml")
-        again = load_lens(tmp_path / "lens.yaml", dtype)
-        before, after = dict(lens.named_parameters()), dict(again.named_parameters())
-        assert before.keys() == after.keys()
-        for name, p in before.items():
-            assert torch.equal(p, after[name]), name
-        assert [type(s) for s in again.surfaces.values()] == [
-            type(s) for s in lens.surfaces.values()
-        ]
-        assert [s.semi_diameter for s in again.surfaces.values()] == [
-            s.semi_diameter for s in lens.surfaces.values()
-        ]
-        for attribute in (
-            *("name", "stop", "index_model", "materials", "sensor_diameter"),
-            *("wavelengths", "reference_wavelength", "fields", "object_distance"),
-        ):
-            assert getattr(again, attribute) == getattr(lens, attribute)
-
-
 @pytest.mark.parametrize("model", ["dfc", "do", "paper"])
 def test_the_index_model_can_be_overridden(model, root, tmp_path):
     lens = load_lens(root / "conf" / "lens" / "cooke_triplet.yaml", index_model=model)
     save_lens(lens, tmp_path / "lens.yaml")
     assert load_lens(tmp_path / "lens.yaml").materials == lens.materials
     assert (lens.materials[0].a == 1.000293) == (model == "do")
-
-
-def test_any_curvature_survives(tmp_path):
-    """1/(1/c) loses a bit for some c; saving must not."""
-    generator = torch.Generator().manual_seed(5)
-    values = torch.rand(200, generator=generator, dtype=torch.float64) * 0.09 - 0.045
-    lens = lens_from_prescription(SINGLET)
-    inexact = 0
-    for value in (*values, torch.zeros((), dtype=torch.float64)):
-        with torch.no_grad():
-            lens.surfaces["2"].curvature.copy_(value)
-        c = float(value)
-        inexact += c != 0.0 and 1.0 / (1.0 / c) != c
-        again = lens_from_prescription(prescription_of(lens))
-        assert float(again.surfaces["2"].curvature.detach()) == c
-    assert inexact > 0
 
 
 def test_a_saved_lens_is_plain_yaml(tmp_path):
@@ -167,21 +121,10 @@ BAD = {
 }  # fmt: skip
 
 
-def one_line(error, path):
-    message = str(error.value)
-    assert "\n" not in message
-    assert message.startswith(str(path))
-    return message
-
-
 @pytest.mark.parametrize("case", BAD)
 def test_bad_prescriptions(case, tmp_path):
     data, said = BAD[case]
-    path = tmp_path / "bad.yaml"
-    path.write_text(yaml.safe_dump(data))
-    with pytest.raises(InputError, match=re.escape(said)) as error:
-        load_lens(path)
-    one_line(error, path)
+    require_refused(tmp_path / "bad.yaml", yaml.safe_dump(data), said)
 
 
 def test_the_good_prescription_is_good(tmp_path):
@@ -198,42 +141,26 @@ def test_the_good_prescription_is_good(tmp_path):
         "\tname: tab",
         "name: !!python/object/apply:os.system ['touch pwned']",
         "name: !!python/object:dolens.Lens {}",
-        "name: !!python/name:os.system",
         "- &a [*b]",
         "name: once\nname: twice",
+        f"a: {'9' * 10_000}",
     ],
 )
 def test_files_that_are_no_plain_yaml(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "bad.yaml"
-    path.write_text(text)
-    with pytest.raises(InputError, match="is not valid YAML") as error:
-        load_lens(path)
-    one_line(error, path)
+    require_refused(tmp_path / "bad.yaml", text, "is not valid YAML")
     assert not (tmp_path / "pwned").exists()
 
 
-def test_a_file_that_is_no_text(tmp_path):
-    path = tmp_path / "bad.yaml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="is not valid YAML") as error:
-        load_lens(path)
-    one_line(error, path)
-
-
-def test_a_missing_file(tmp_path):
-    path = tmp_path / "none.yaml"
-    with pytest.raises(InputError, match=r"cannot be read \(No such file") as error:
-        load_lens(path)
-    one_line(error, path)
-
-
-def test_another_kind_of_file(tmp_path):
-    path = tmp_path / "lens.doc"
-    path.write_text("Dear reader")
-    with pytest.raises(InputError, match=r"lens files end in \.yaml") as error:
-        load_lens(path)
-    one_line(error, path)
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("none.yaml", "cannot be read (No such file"), ("lens.doc", "lens files end in .yaml")],
+)
+def test_files_that_are_not_there_or_of_another_kind(name, said, tmp_path):
+    (tmp_path / "lens.doc").write_text("Dear reader")
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path / name}: ")) as error:
+        load_lens(tmp_path / name)
+    assert said in str(error.value) and "\n" not in str(error.value)
 
 
 BEYOND_SINGLE = {

@@ -7,9 +7,11 @@ import pytest
 from dolens import InputError
 from dolens.files import decode_text
 from tests.prescriptions.samples import require_refused
-from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
+from tests.prescriptions.zemax.samples import GLASS, lens_of, singlet
 
 GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
+
+
 BAD = {
     "superconic": (singlet("TYPE SUPERCON", *GOOD),
                    "surface 1: a superconic is not held (TYPE SUPERCON; allowed: "),
@@ -87,8 +89,6 @@ BAD = {
     "no surfaces": ("MODE SEQ\n", "needs an object, a surface and an image"),
     "aspheric image": (singlet(*GOOD, image="TYPE EVENASPH\n  CURV 0.1\n  PARM 2 1e-5"),
                        "the image: an aspheric image is not held"),
-    "round object": (singlet(*GOOD, head="FLOA\nYFLN 3\n", object_distance="90\n  CURV 0.1"),
-                     "the object: a curved object (radius 10 mm) is not held for fields off"),
     "primary wavelength": (singlet(*GOOD, head="WAVM 1 0.55 1\nPWAV 2\n"),
                            "PWAV 2 is none of the wavelengths 1 to 1"),
     "heights at infinity": (singlet(*GOOD, head="FTYP 1 0 1 1\nYFLN 5\n"),
@@ -96,6 +96,35 @@ BAD = {
     "aperture beyond the sphere": (singlet("CURV 0.2", "CLAP 0 6 0", GLASS),
                                    "surface 1: semi_diameter 6 mm exceeds"),
 }  # fmt: skip
+
+
+# Type, its lines, and what is said of them.
+SHAPES = [
+    ("FZERNSAG", ("PARM 0 0", "XDAT 1 4", "XDAT 2 4"), "the aperture reaches 5 mm"),
+    ("FZERNSAG", ("XDAT 1 38", "XDAT 2 9"), "terms from 0 to 37, not 38"),
+    ("SZERNSAG", ("XDAT 1 4",), "XDAT 2, the normalization radius, must be positive"),
+    ("TOROIDAL", ("PARM 1 30", "XDAT 4 0.1"), "Zernike polynomials on a toroid"),
+    ("QED_TYPE", ("XDAT 1 2", "XDAT 3 5"), "XDAT 1 must be 0 "),
+    ("ODDASPHE", ("PARM 9 1",), "PARM 9 is 1, but TYPE ODDASPHE has PARM 1 to 8"),
+    ("BICONICX", ("PARM 3 1",), "PARM 3 is 1"),
+    ("BINARY_2", ("XDAT 1 1", "XDAT 2 1", "XDAT 3 5"), "PARM 0, the order of diffraction"),
+    ("BINARY_2", ("PARM 0 0.5",), "must be a whole number"),
+    ("BINARY_2", ("PARM 0 1", "XDAT 1 1", "XDAT 2 0"), "XDAT 2, the radius"),
+    ("BINARY_1", ("PARM 0 1", "XDAT 1 999"), "number of terms from 0 to 230"),
+    ("DGRATING", ("PARM 1 0.6", "PARM 2 1", "PARM 3 4.0"), "PARM 3 is 4.0"),
+    ("PARAXIAL", ("PARM 1 0",), "focal length of a PARAXIAL lens, is 0"),
+    ("BINARY_3", ("PARM 0 1",), "a diffractive phase is not held"),
+    ("PARAX_XY", ("PARM 1 1",), "a paraxial lens of two focal lengths is not held"),
+    ("IRREGULA", ("PARM 3 0.1",), "own decenter or tilt"),
+    ("IRREGULA", ("PARM 6 0.1", "PARM 8 45"), "turned about the axis"),
+    ("FZERNPHA", ("PARM 1 1", "XDAT 1 4", "XDAT 2 1"), "PARM 0, the order of diffraction"),
+    ("FZERNPHA", ("PARM 0 1", "XDAT 1 4", "XDAT 2 2.5"), "which ends at 2.5 mm"),
+    ("SZERNPHA", ("PARM 0 1", "XDAT 1 92", "XDAT 2 1"), "a number of terms from 0 to 91"),
+]
+BAD |= {
+    f"{kind} {lines}": (singlet(f"TYPE {kind}", *lines, *GOOD), said)
+    for kind, lines, said in SHAPES
+}
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -1,11 +1,16 @@
 """Apertures and obscurations in Zemax's files."""
 
 import pytest
+import torch
 
-from dolens import InputError
+from dolens import InputError, Rays
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
-from tests.prescriptions.zemax_samples import GLASS, singlet
+from tests.prescriptions.zemax.samples import GLASS, lens_of, singlet, surface
+
+FRONT = ("CURV 0.02", "DISZ 4", GLASS)
+HEAD = "ENPD 16\nFTYP 0 0 1 1\nYFLN 0\nWAVM 1 0.55 1\n"
+
 
 APERTURES = {
     "rectangle": {"aperture": {"half_width_x": 5.0, "half_width_y": 4.0}},
@@ -34,6 +39,8 @@ APERTURES = {
     "no edge": {"semi_diameter": 5.0, "clips": False},
     "left to the fields": {"semi_diameter": "auto"},
 }  # fmt: skip
+
+
 WRITTEN = {
     "rectangle": "SQAP 5.0 4.0",
     "ring": "CLAP 2.0 5.0 0",
@@ -130,3 +137,52 @@ def test_a_circle_of_1e10_has_no_edge_but_its_hole():
 def test_outlines_that_are_not_held_say_why(lines, message):
     with pytest.raises(InputError, match=message):
         with_aperture(*lines)
+
+
+def test_a_rectangular_stop_takes_light_from_the_pupil(tmp_path):
+    lens = lens_of(singlet(*FRONT, "SQAP 9 1", head="ENPD 6\n"), tmp_path)
+    aperture = lens.surfaces["1"].aperture
+    assert (aperture.edge.semi_diameter, aperture.window.half_width_y) == (pytest.approx(3.0), 1.0)
+    points = torch.tensor([[2.9, 0.0], [3.1, 0.0], [0.0, 0.9], [0.0, 1.1]], dtype=torch.float64)
+    assert (aperture.margin(*points.T) > 0.0).tolist() == [True, False, True, False]
+    position = torch.cat([points, torch.zeros(4, 1, dtype=torch.float64)], 1)
+    for backend in ("reference", "cpu"):
+        lens.backend = backend
+        hit = lens.trace(Rays(position, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 550.0))
+        assert hit.valid.tolist() == [True, False, True, False]
+
+
+def test_an_ellipse_beside_the_vertex(tmp_path):
+    """((x - 1)/2)² + ((y - 3)/1)² < 1."""
+    lens = lens_of(singlet(*FRONT, last="ELAP 2 1 0\n  OBDC 1 3", head="ENPD 20\n"), tmp_path)
+    lens.surfaces["1"].aperture = lens.surfaces["1"].aperture.opened()
+    points = torch.tensor([[1.0, 3.9], [1.0, 4.1], [2.9, 3.0], [3.1, 3.0], [0.0, 0.0]]).double()
+    inside = lens.surfaces["2"].aperture.margin(*points.T) > 0.0
+    assert inside.tolist() == [True, False, True, False, False]
+    position = torch.cat([points, torch.zeros(5, 1).double()], 1)
+    rays = Rays(position, torch.tensor([0.0, 0.0, 1.0]).double(), 550.0)
+    passing = []
+    for backend in ("reference", "cpu"):
+        lens.backend = backend
+        passing.append(lens.trace(rays).valid.tolist())
+    assert passing[0] == passing[1]
+    assert passing[0][4] is False
+
+
+def test_a_drawn_size_of_nothing_lets_light_pass(tmp_path):
+    """Programs draw a plane that is only there to measure from with a semi-diameter of 1e-6."""
+    text = HEAD + "".join(
+        (
+            surface(0, "DISZ INFINITY"),
+            surface(1, "CURV 0", "DISZ 5", "DIAM 9.99999997E-7 1 0 0 1"),
+            surface(2, "STOP", "CURV 0.02", "DISZ 4", "GLAS ___BLANK 1 0 1.5 0 0"),
+            surface(3, "CURV -0.02", "DISZ 40", "DIAM 1E-6 1 0 0 1", "OBSC 0 1 0"),
+            surface(4, ""),
+        )
+    )
+    lens = lens_of(text, tmp_path)
+    start = torch.tensor([[0.0, 7.9, -9.0], [0.0, 0.5, -9.0]], dtype=torch.float64)
+    ahead = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(2, 3)
+    for backend in ("reference", "cpu"):
+        lens.backend = backend
+        assert lens.trace(Rays(start, ahead, 550.0)).valid.tolist() == [True, False]

@@ -1,4 +1,4 @@
-"""Surfaces given by their sag in Zemax files: read as meant, written, and read again."""
+"""Shapes of surfaces in Zemax's files: read as meant, written, and read again."""
 
 import math
 import re
@@ -13,9 +13,8 @@ from dolens.prescriptions.codev.surface import LETTERS, SPECIALS
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
 from dolens.prescriptions.zemax.shapes import SHAPES
 from dolens.prescriptions.zemax.writer import zemax_of
-from tests.prescriptions.zemax_samples import singlet
+from tests.prescriptions.zemax.samples import GLASS, lens_of, singlet
 
-GLASS = "GLAS ___BLANK 1 0 1.5 6.0E+1 0 0 0 0 0 0"
 DIAM = 'DIAM 5 1 0 0 1 ""'
 
 
@@ -113,24 +112,6 @@ def test_a_file_in_inches_means_the_same_surface(lines, expected):
 
 
 @pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (["TYPE FZERNSAG", "PARM 0 0", "XDAT 1 4", "XDAT 2 4"], "aperture reaches 5 mm .* 4 mm"),
-        (["TYPE FZERNSAG", "XDAT 1 38", "XDAT 2 9"], "terms from 0 to 37, not 38"),
-        (["TYPE SZERNSAG", "XDAT 1 4"], "XDAT 2, the normalization radius, must be positive"),
-        (["TYPE TOROIDAL", "PARM 1 30", "XDAT 4 0.1"], "Zernike polynomials on a toroid"),
-        (["TYPE QED_TYPE", "XDAT 1 2", "XDAT 3 5"], "XDAT 1 must be 0 .* or 1 .*, not 2"),
-        (["TYPE ODDASPHE", "PARM 9 1"], "PARM 9 is 1, but TYPE ODDASPHE has PARM 1 to 8"),
-        (["TYPE BICONICX", "PARM 3 1"], "PARM 3 is 1"),
-    ],
-)
-def test_what_no_surface_holds_is_refused_by_its_line(lines, message):
-    with pytest.raises(InputError, match=message) as error:
-        read(*lines)
-    assert "surface 1" in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("row", "message"),
     [
         ({"type": "odd_asphere", "radius": 9.0, "conic": 0.0, "a9": 1e-9}, "cannot hold 'a9'"),
@@ -183,3 +164,41 @@ def test_a_coefficient_times_its_powers_of_length_is_a_length(dimension, table):
         if power or monomial or re.fullmatch(r"[pqz]\d+", number.key):
             degree = int(power[1]) if power else sum(monomial or (0,))
             assert number.power + (degree if dimension else 0) == dimension, slot
+
+
+def test_unused_coefficients_are_not_parameters():
+    """Zemax lists all eight, used or not."""
+    parm = [f"PARM {n} {1e-6 if n == 3 else 0}" for n in range(1, 9)]
+    found = prescription_from_zemax(singlet("TYPE EVENASPH", "CURV 0.02", "DIAM 5", *parm))
+    row = found["surfaces"]["1"]
+    assert {key: row[key] for key in row if key[0] == "a"} == {"a4": 0.0, "a6": 1e-6}
+
+
+@pytest.mark.parametrize(("c", "k"), [(0.0, 0.0), (0.0, 3.0), (0.02, -1.0), (0.04, 0.5)])
+def test_a_square_term_is_a_coefficient(c, k, tmp_path):
+    """The sag is the conic's, plus α·r² + a4·r⁴."""
+    alpha, a4 = 0.004, 1e-6
+    text = singlet(
+        "TYPE EVENASPH", f"CURV {c}", f"CONI {k}", f"PARM 1 {alpha}", f"PARM 2 {a4}", "DIAM 5"
+    )
+    lens = lens_of(text, tmp_path)
+    shape = lens.surfaces["1"]
+    r = torch.linspace(0.0, 5.0, 11, dtype=torch.float64)
+    sag, *_ = shape.sag_and_gradient(dict(shape.named_parameters()), r, torch.zeros_like(r))
+    conic = c * r**2 / (1 + (1 - (1 + k) * c**2 * r**2).sqrt())
+    assert (sag - conic - alpha * r**2 - a4 * r**4).abs().max() < 1e-15
+
+
+def test_a_tilted_plane_is_a_polynomial():
+    found = prescription_from_zemax(singlet("TYPE TILTSURF", "PARM 1 0.1", "PARM 2 -0.2", "DIAM 5"))
+    row = found["surfaces"]["1"]
+    assert (row["type"], row["x"], row["y"]) == ("xy_polynomial", 0.1, -0.2)
+
+
+def test_a_polynomial_is_read_with_its_radius_of_normalization():
+    """A coefficient A of (x/R)²·(y/R), a length u·A, is u·A/(u·R)³ in mm^-2."""
+    data = [5.0, 2.0, *(0.0,) * 5, 8.0]
+    lines = [f"XDAT {n} {value}" for n, value in enumerate([6, *data[1:]], 1)]
+    text = singlet("TYPE XPOLYNOM", *lines, "DIAM 5", head="UNIT CM\nFLOA\n")
+    row = prescription_from_zemax(text)["surfaces"]["1"]
+    assert row["x3"] == pytest.approx(8.0 * 10.0 / 20.0**3, rel=1e-15)

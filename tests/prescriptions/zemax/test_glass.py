@@ -13,9 +13,9 @@ from dolens.optics.glass_catalog import find_glass
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.zemax.glass import read_glass
-from dolens.prescriptions.zemax.reader import prescription_from_zemax
+from dolens.prescriptions.zemax.reader import prescription_from_zemax, read_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
-from tests.prescriptions.zemax_samples import singlet
+from tests.prescriptions.zemax.samples import singlet, surface
 
 NOTHING = "0 0 1.5 40 0 0 0 0 0 0"  # what Zemax writes beside a name
 
@@ -88,8 +88,12 @@ def test_fused_silica_by_another_name(caplog):
 
 
 MODELS = {
+    "AIR": "air",
     "___BLANK 1 0 1.5168 64.17 0 0 0 0 0 0": "1.5168/64.17/0",
-    "___BLANK 1 0 1.5168 64.17": "1.5168/64.17/0",
+    "___BLANK 1 0 1.5168E+000 6.417E+1": "1.5168/64.17/0",
+    "___BLANK 1 0 1.51680 64.170 0": "1.51680/64.170/0",
+    # ΔPgF of the two terms of the index model.
+    "___BLANK 1 0 1.51680 64.170 0.005098803673": "1.51680/64.170",
     "___BLANK 1 0 1.5 6.41673E+1 -9.E-4 0 0 0 0 0": "1.5/64.1673/-0.0009",
     "N-BK7 1 0 1.52 60 0": "1.52/60/0",
     "___BLANK 1 0 1.5 0 0": "1.5",
@@ -140,6 +144,13 @@ def test_a_pick_up_from_nowhere(surfaces):
         pickup(*surfaces)
 
 
+def test_a_refusal_says_what_could_be_written_instead():
+    with pytest.raises(InputError) as error:
+        material("ZK99 0 0 1.63636 35.34 0 0 0 0 0 0", "SCHOTT")
+    instead = str(error.value).rpartition("write GLAS ")[2]
+    assert material(instead, "SCHOTT") == "1.63636/35.34/0"
+
+
 def test_a_file_s_temperature_and_its_pick_ups():
     """ENVD with 1 as third number: indices are those at 60 °C and 0.5 atm."""
     head = "GCAT SCHOTT\nFLOA\nENVD 60 0.5 1\n"
@@ -153,13 +164,8 @@ def test_a_file_s_temperature_and_its_pick_ups():
     assert abs(warm.index(550.0) - find_glass("SCHOTT:SF6").index(550.0)) > 1e-4
     written = prescription_from_zemax(zemax_of(prescription_of(lens)), "lens.zmx")
     assert lens_from_prescription(written).materials == lens.materials
-
-
-def test_a_refusal_says_what_could_be_written_instead():
-    with pytest.raises(InputError) as error:
-        material("ZK99 0 0 1.63636 35.34 0 0 0 0 0 0", "SCHOTT")
-    instead = str(error.value).rpartition("write GLAS ")[2]
-    assert material(instead, "SCHOTT") == "1.63636/35.34/0"
+    catalogue = prescription_from_zemax(text.replace("0.5 1", "0.5 0"), "lens.zmx")
+    assert not {"temperature", "pressure"} & catalogue.keys()
 
 
 REFUSED = {
@@ -291,3 +297,45 @@ def test_a_file_traces_by_the_glass_it_means(tmp_path):
     path.write_text(text.replace("CURV -0.02", "CURV 0.0"))
     efl = load_lens(path, torch.float64).first_order(587.5618).efl.item()
     assert efl == pytest.approx(50.0 / 0.62004, rel=2e-5)
+
+
+def air(*lines):
+    return singlet(
+        "CURV 0.02", "DISZ 4", "GLAS ___BLANK 1 0 1.5 0 0", head="ENPD 16\nWAVM 1 0.55 1\n"
+    ) + "".join(f"{line}\n" for line in ("MNUM 2 1", *lines))
+
+
+def test_a_gap_at_a_pressure_of_its_own_is_refused():
+    own = ("PRES 0 1 0.0 0 0 0 1 1", 'GLSS 2 1 "" 0 0 0', "PRES 0 1 1.0 0 0 0", 'GLSS 1 1 ""')
+    with pytest.raises(InputError, match="surface 2: a medium at a temp"):
+        read_zemax(air(*own))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("TEMP 0 1 20 0 0 0", "PRES 0 1 1 0 0 0", 'GLSS 1 1 "" 0 0'),
+        ("PRES 0 2 0.5 0 0 0", 'GLSS 1 2 "" 0 0', 'GLSS 1 1 "" 0 0'),
+        ("PRES 0 1 0.5 0 0 0", "THIC 1 1 4 0 0"),
+        ("MNUM 2", "TEMP 0 1 50 0 0 0", "TEMP 0 2 20 0 0", 'GLSS 1 1 "A" 0 0', 'GLSS 1 2 "A" 0 0'),
+    ],
+    ids=["as the system", "of another configuration", "no glass behind it", "one as the system"],
+)
+def test_media_in_the_air_of_the_system_are_held(lines):
+    assert len(read_zemax(air(*lines)).prescription["surfaces"]) == 2
+
+
+def test_a_glass_that_schott_gave_up_stands_beside_schotts_own_both_ways():
+    """Schott's SSK4 had the nd and Vd of Sumita's, which is read where GCAT names Schott first; and
+    SK16 was made by both.
+    """
+    glasses = {1: "SSK4", 2: "SK16", 3: "F15", 4: "SK1"}
+    head = "GCAT SCHOTT SUMITA\nENPD 4\n"
+    rows = [surface(n, "DISZ 2", f"CURV 0.0{n}", f"GLAS {name}") for n, name in glasses.items()]
+    rows[0] += "  STOP\n"
+    text = head + surface(0, "DISZ INFINITY") + "".join(rows)
+    text += surface(5, "CURV 0.01", "DISZ 9") + surface(6, "")
+    found = prescription_from_zemax(text)
+    named = [row["material"] for row in found["surfaces"].values()]
+    assert named == ["SUMITA:SSK4", "SCHOTT:SK16", "SCHOTT:F15", "SCHOTT:SK1", "air"]
+    assert prescription_from_zemax(zemax_of(found))["surfaces"] == found["surfaces"]

@@ -3,7 +3,7 @@
 import pytest
 
 from dolens import InputError, load_lens
-from tests.prescriptions.codev_samples import SINGLET, TRIPLET, system
+from tests.prescriptions.codev.samples import SINGLET, TRIPLET, system
 from tests.prescriptions.samples import require_refused
 
 LAST = "S -50 40\n CIR 5"
