@@ -30,8 +30,10 @@ from dolens.prescriptions.files import (
 )
 from dolens.prescriptions.plain_values import plain_values, yaml_of
 from scripts.guarded_cases import guarded, place_of
-from tests.prescriptions import codev_samples, test_json_lenses, test_oslo, zemax_samples
+from tests.prescriptions import test_json_lenses, test_oslo
+from tests.prescriptions.codev import samples as codev_samples
 from tests.prescriptions.mutations import mutated
+from tests.prescriptions.zemax import samples as zemax_samples
 
 LONGEST = 500
 # How often files of each kind are drawn; the prescriptions are of dolens, the rest of others too.
