@@ -8,21 +8,9 @@ from dolens.errors import InputError
 from dolens.reconstruction import opponent_wiener_deconvolve, wiener_deconvolve
 from dolens.reconstruction.opponent_wiener import OPPONENT, OpponentWiener, check_functions
 from dolens.reconstruction.unrolled_splitting import splitting_data_step
+from tests.reconstruction.scenes import blur, raw_image
 
 RATIOS = torch.tensor([0.02, 0.2, 0.5], dtype=torch.float64)
-
-
-def raw_image(height=15, width=18):
-    generator = torch.Generator().manual_seed(0)
-    return torch.rand(2, 3, height, width, generator=generator, dtype=torch.float64)
-
-
-def blur(depths=2, size=5):
-    """Point spread functions that differ in depth and colour, of unit sum."""
-    generator = torch.Generator().manual_seed(1)
-    found = torch.rand(depths, 3, size, size, generator=generator, dtype=torch.float64)
-    found[:, :, size // 2, size // 2] += 8.0
-    return found / found.sum((-2, -1), keepdim=True)
 
 
 def blurred(picture, function):
@@ -132,7 +120,7 @@ def test_the_data_step_is_the_minimum_of_its_sum_of_squares():
 
 @pytest.mark.parametrize("step", ["deconvolution", "data step"])
 def test_gradients_are_those_of_differences(step):
-    raw, functions = raw_image(7, 6)[:1].requires_grad_(), blur(size=3).requires_grad_()
+    raw, functions = raw_image(5, 4)[:1].requires_grad_(), blur(size=3).requires_grad_()
     ratios = RATIOS.clone().requires_grad_()
     if step == "deconvolution":
         arguments = (raw, functions, ratios)
@@ -140,7 +128,7 @@ def test_gradients_are_those_of_differences(step):
         def call(raw, functions, ratios):
             return opponent_wiener_deconvolve(raw, functions, ratios, margin=1)
     else:
-        guess = raw_image(7, 6)[:1].flip(-1).detach().requires_grad_()
+        guess = raw_image(5, 4)[:1].flip(-1).detach().requires_grad_()
         arguments = (raw, functions, ratios, guess)
 
         def call(raw, functions, ratios, guess):
