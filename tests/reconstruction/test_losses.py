@@ -1,14 +1,17 @@
+"""Losses between restored and true images, and the features that one of them compares."""
+
 import copy
-import logging
+import io
 
 import pytest
 import torch
+from torch.nn import functional
 
 from dolens.errors import InputError
 from dolens.reconstruction import (
-    PretrainedWeightsUnavailable,
     RestorationLoss,
     VGG16Features,
+    load_vgg16_weights,
     mean_absolute_error,
     mean_squared_error,
     perceptual_loss,
@@ -117,50 +120,17 @@ def test_training_works_after_validation_in_inference_mode(vgg16_file):
     assert restored.grad.abs().max() > 0
 
 
-def test_none_trains_without_the_perceptual_term_in_silence(caplog):
-    loss = RestorationLoss(perceptual="none")
-    assert not loss.perceptual_available
-    assert loss(*images()).keys() == {"total", "mse", "tv"}
-    assert caplog.records == []
+@pytest.mark.parametrize("perceptual", ["none", "auto"])
+def test_without_weights_it_trains_without_the_perceptual_term(perceptual):
+    terms = RestorationLoss(perceptual=perceptual)(*images())
+    assert terms.keys() == {"total", "mse", "tv"}
+    torch.testing.assert_close(terms["total"], terms["mse"] + 1e-4 * terms["tv"])
 
 
 def test_weight_zero_never_looks_for_weights(caplog):
     loss = RestorationLoss(perceptual_weight=0.0, perceptual="vgg16", vgg16_weights="/absent")
     assert not loss.perceptual_available
     assert caplog.records == []
-
-
-def test_auto_without_weights_warns_once_and_trains(caplog):
-    with caplog.at_level(logging.WARNING, logger="dolens.reconstruction.losses"):
-        loss = RestorationLoss(perceptual="auto")
-        terms = [loss(*images()) for _ in range(2)][-1]
-    said = [record for record in caplog.records if record.name == "dolens.reconstruction.losses"]
-    assert len(said) == 1
-    assert said[0].levelno == logging.WARNING
-    assert "WITHOUT THE PERCEPTUAL TERM" in said[0].getMessage()
-    assert "loss.vgg16_weights=FILE" in said[0].getMessage()
-    torch.testing.assert_close(terms["total"], terms["mse"] + 1e-4 * terms["tv"])
-
-
-def test_only_the_word_download_uses_the_network(caplog):
-    RestorationLoss(perceptual="auto")
-    with pytest.raises(PretrainedWeightsUnavailable):
-        RestorationLoss(perceptual="vgg16")
-    assert "downloading" not in caplog.text
-    with pytest.raises(PretrainedWeightsUnavailable, match="no network in tests"):
-        RestorationLoss(perceptual="download")
-    assert "downloading VGG-16 weights for the perceptual loss (528 MB)" in caplog.text
-
-
-def test_vgg16_without_weights_refuses():
-    with pytest.raises(PretrainedWeightsUnavailable, match=r"by loss\.perceptual=download"):
-        RestorationLoss(perceptual="vgg16")
-
-
-@pytest.mark.parametrize("perceptual", ["auto", "vgg16"])
-def test_a_given_file_that_is_missing_is_an_error_in_every_mode(perceptual):
-    with pytest.raises(InputError, match=r"/absent\.pth: no such file"):
-        RestorationLoss(perceptual=perceptual, vgg16_weights="/absent.pth")
 
 
 def test_another_word_gets_the_allowed_ones_and_the_nearest():
@@ -175,3 +145,90 @@ def test_a_negative_weight_is_refused_by_name():
     for name in ("tv_weight", "l1_weight"):
         with pytest.raises(InputError, match=f"{name}=-1"):
             RestorationLoss(perceptual="none", **{name: -1})
+
+
+# ---------------------------------------------------------------- features of VGG-16
+
+
+def test_features_are_vgg16_up_to_the_third_convolution_of_the_third_block(vgg16_state):
+    image, _ = images()
+    expected = image.sub(torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1))
+    expected = expected.div(torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1))
+    for number in (0, 2, 5, 7, 10, 12, 14):
+        weight, bias = vgg16_state[f"{number}.weight"], vgg16_state[f"{number}.bias"]
+        expected = functional.conv2d(expected, weight, bias, padding=1)
+        if number != 14:
+            expected = expected.relu()
+        if number in (2, 7):
+            expected = functional.max_pool2d(expected, 2)
+    features = VGG16Features(vgg16_state)(image)
+    assert features.shape == (2, 256, 3, 4)
+    torch.testing.assert_close(features, expected)
+
+
+def test_features_are_frozen_and_see_the_image_clamped(vgg16_state):
+    features = VGG16Features(vgg16_state)
+    image, _ = images()
+    assert not features.training
+    assert not any(parameter.requires_grad for parameter in features.parameters())
+    beyond = 3 * image - 1
+    assert torch.equal(features(beyond), features(beyond.clamp(0, 1)))
+
+
+def test_features_keep_their_own_copy_of_the_weights(vgg16_state):
+    before = {name: value.clone() for name, value in vgg16_state.items()}
+    VGG16Features(vgg16_state).double().layers[0].weight.zero_()
+    assert all(torch.equal(vgg16_state[name], value) for name, value in before.items())
+    assert all(value.dtype == torch.float32 for value in vgg16_state.values())
+
+
+def test_loss_is_zero_for_equal_images_and_the_mean_square_otherwise(vgg16_state):
+    features = VGG16Features(vgg16_state)
+    restored, truth = images()
+    assert perceptual_loss(features, truth, truth) == 0
+    expected = (features(restored) - features(truth)).square().mean()
+    assert expected > 0
+    torch.testing.assert_close(perceptual_loss(features, restored, truth), expected)
+
+
+def test_gradient_reaches_the_restored_image(vgg16_state):
+    features = VGG16Features(vgg16_state).double()
+    restored, truth = (image[:1].double() * 0.8 + 0.1 for image in images())
+    restored.requires_grad_()
+    perceptual_loss(features, restored, truth).backward()
+    direction = torch.randn(restored.shape, generator=torch.Generator().manual_seed(1)).double()
+    step = 1e-6
+    ahead, behind = (
+        perceptual_loss(features, restored.detach() + sign * step * direction, truth)
+        for sign in (1, -1)
+    )
+    slope = (ahead - behind) / (2 * step)
+    torch.testing.assert_close((restored.grad * direction).sum(), slope, rtol=1e-5, atol=0)
+
+
+def test_a_features_only_file_and_a_full_one_give_the_same(vgg16_state, vgg16_file, tmp_path):
+    full = {f"features.{name}": value for name, value in vgg16_state.items()}
+    full["features.17.weight"] = full["classifier.0.weight"] = torch.zeros(1)
+    torch.save(full, tmp_path / "full.pth")
+    for file in (vgg16_file, str(tmp_path / "full.pth")):
+        weights = load_vgg16_weights(file)
+        assert weights.keys() == vgg16_state.keys()
+        assert all(torch.equal(weights[name], vgg16_state[name]) for name in weights)
+
+
+def test_features_fit_in_a_buffer_and_back(vgg16_state):
+    buffer = io.BytesIO()
+    torch.save(VGG16Features(vgg16_state).state_dict(), buffer)
+    buffer.seek(0)
+    assert "layers.0.weight" in torch.load(buffer, weights_only=True)
+
+
+def test_weights_of_another_network_are_refused_by_layer(vgg16_state, tmp_path):
+    cases = [
+        ({"conv1.weight": torch.zeros(1)}, r"no features\.0\.weight"),
+        ({**vgg16_state, "5.weight": torch.zeros(2, 2)}, r"features\.5\.weight has shape \(2, 2\)"),
+    ]
+    for content, message in cases:
+        torch.save(content, tmp_path / "wrong.pth")
+        with pytest.raises(InputError, match=message):
+            load_vgg16_weights(str(tmp_path / "wrong.pth"))
