@@ -67,9 +67,7 @@ def test_a_restorer_of_known_blur_says_so_and_refuses_without_it(kind):
     if kind in DECONVOLVING:
         with pytest.raises(InputError, match="needs the lens's point spread functions, got None"):
             RESTORERS[kind]()(raw, None)
-        with pytest.raises(
-            InputError, match=r"\(3, 5, 5\): expected \((depths|2), 3, K, K\)"
-        ):
+        with pytest.raises(InputError, match=r"\(3, 5, 5\): expected \((depths|2), 3, K, K\)"):
             RESTORERS[kind]()(raw, functions[0])
 
 
