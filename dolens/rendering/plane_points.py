@@ -50,12 +50,15 @@ def plane_points(
 
     Args:
         imaging: the lens, D depths and C wavelengths, the pupil's disc and the pixels' pitch.
-        points: x and y on the sensor, mm, each (N,), double precision.
+        points: x and y on the sensor, mm, each (N,), double precision, on any device.
         disc: x and y of the rays in the disc, in units of its radius, each (N or 1, S), in the
             frame in which a symmetric lens's point lies on the positive x axis.
+
+    Returns:
+        What rays see, on the lens's device.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
-    x, y = points
+    x, y = points = _beside(system, points)
     again = None
     if system.rotationally_symmetric:
         # Sorted radii, and which of them each point has.
@@ -139,16 +142,17 @@ def chief_ray_points(
 
     Args:
         imaging: as in `plane_points`.
-        points: x and y, mm, each (N,).
+        points: x and y, mm, each (N,), on any device.
 
     Returns:
-        Rows and columns from the axis in the image of a pinhole, each (N, D, C).
+        Rows and columns from the axis in the image of a pinhole, each (N, D, C), on the lens's
+        device.
 
     Raises:
         InputError: such a ray misses a surface or is totally reflected, so that it says nothing.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
-    x, y = (p.to(system.dtype) for p in points)
+    x, y = (p.to(system.dtype) for p in _beside(system, points))
     zero = torch.zeros_like(x)
     ray = rays_to_exit_pupil(x, y, system.vertices[-1], zero, zero, imaging.pupil.z)
     wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
@@ -178,11 +182,17 @@ def distinct_radii(points: tuple[Tensor, Tensor]) -> Tensor:
 
 def pinhole_points(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Find where a pinhole sees sensor points, as `chief_ray_points`: (N, D, C) each."""
-    x, y = points
+    x, y = _beside(imaging.system, points)
     pitch = imaging.sensor.pixel_pitch
     rows, columns = y / pitch, -x / pitch
     shape = (len(x), len(imaging.scene.depths), len(imaging.scene.wavelengths))
     return rows[:, None, None].expand(shape), columns[:, None, None].expand(shape)
+
+
+def _beside(system: OpticalSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Points of the sensor on the lens's device."""
+    x, y = points
+    return x.to(system.device), y.to(system.device)
 
 
 def _rounded(radius: Tensor) -> Tensor:

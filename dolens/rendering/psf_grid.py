@@ -221,7 +221,7 @@ def object_points(
         -1,
     )
     wavelengths = torch.tensor(scene.wavelengths, **options).expand(shape)
-    centres = torch.stack(points, -1)[:, None, None].expand(*shape, 2)
+    centres = torch.stack(points, -1).to(system.device)[:, None, None].expand(*shape, 2)
     return positions.reshape(-1, 3), wavelengths.reshape(-1), centres.reshape(-1, 2)
 
 

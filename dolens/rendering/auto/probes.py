@@ -132,7 +132,7 @@ def blurred_grey_levels(kernels: Tensor, transfer: Tensor) -> Tensor:
     side = transfer.shape[0]
     spectrum = torch.fft.rfft2(kernels.double(), s=(side, side))
     squared = spectrum.real.square() + spectrum.imag.square()
-    power = probe_power(side).to(kernels.device) * (1.0 - transfer).square()
+    power = (probe_power(side) * (1.0 - transfer.cpu()).square()).to(kernels.device)
     return (squared * power).sum((-2, -1)).sqrt() / GREY_LEVEL
 
 
