@@ -5,15 +5,12 @@ import sys
 import numpy as np
 import pytest
 import torch
-from matplotlib.image import imread
 from PIL import Image
 
-from dolens import load_lens
 from dolens.errors import InputError
 from dolens.plotting import (
     figure_to_image,
     history_figure,
-    layout_figure,
     save_figure,
     save_figures,
 )
@@ -83,20 +80,3 @@ def test_a_figure_is_laid_out_for_all_its_files_at_once(tmp_path, monkeypatch):
     with pytest.raises(IsADirectoryError):
         save_figure(figure, tmp_path / "a folder.png")
     assert figure.get_layout_engine() is engine
-
-
-def test_no_label_is_cut_at_the_edge_of_a_saved_layout(root, tmp_path):
-    """A plate of some picometres, whose sags have long numbers."""
-    lens = load_lens(root / "conf/lens/wavefront_coding.yaml").requires_grad_(False)
-    lens.surfaces["5"].x3.fill_(1e-11)
-    save_figure(layout_figure(lens, fields_deg=(0.0, 0.5), rays=3), tmp_path / "layout.png")
-    pixels = imread(tmp_path / "layout.png")[..., :3]
-    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
-        assert (edge == 1.0).all()
-
-
-def test_a_plate_without_sag_is_not_plotted(root):
-    lens = load_lens(root / "conf/lens/wavefront_coding.yaml").requires_grad_(False)
-    lens.surfaces["5"].x3.fill_(0.0)
-    lens.surfaces["5"].y3.fill_(0.0)
-    assert len(layout_figure(lens, rays=3).axes) == 1

@@ -1,82 +1,20 @@
+"""Pictures of a camera and of sources, each in its place."""
+
 import numpy as np
 import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.plotting import comparison_figure, psf_figure
-
-
-def spots(size=41):
-    """Unit sums; 1, 3×3 and 9×9 equal pixels, in one channel each of three depths."""
-    psfs = torch.zeros(3, 3, size, size, dtype=torch.float64)
-    middle = size // 2
-    for depth, reach in enumerate((0, 1, 4)):
-        box = slice(middle - reach, middle + reach + 1)
-        psfs[depth, depth, box, box] = 1.0 / (2 * reach + 1) ** 2
-    return psfs
+from dolens.experiments.poses.pose_figures import image_labels
+from dolens.plotting import (
+    comparison_figure,
+)
+from dolens.plotting.pictures import spot_fit_figure
+from tests.plotting.overlaps import flaws
 
 
 def pictures(figure):
     return [np.asarray(axes.images[0].get_array()) for axes in figure.axes]
-
-
-def texts(axes):
-    return [text.get_text() for text in axes.texts]
-
-
-def test_psfs_are_cropped_alike_to_the_window_of_the_widest():
-    figure = psf_figure(spots(), ["1m", "2m", "8m"], 0.00345, "spots")
-    assert [axes.get_title().partition("\n")[0] for axes in figure.axes] == ["1m", "2m", "8m"]
-    assert [picture.shape for picture in pictures(figure)] == [(11, 11, 3)] * 3
-    assert all(axes.images[0].get_interpolation() == "nearest" for axes in figure.axes)
-
-
-def test_a_faint_halo_beyond_a_fifth_of_a_percent_widens_the_window():
-    def window(halo):
-        psfs = spots()
-        psfs[0] *= 1.0 - halo
-        psfs[0, 0, 0, 0] = halo
-        return pictures(psf_figure(psfs, "abc", 0.01))[0].shape[0]
-
-    # To the corner where the halo is, and a pixel about it on the other sides.
-    assert (window(0.0015), window(0.0025)) == (11, 27)
-
-
-def test_each_psf_is_normalised_to_its_own_printed_peak():
-    figure = psf_figure(spots(), "abc", 0.00345)
-    for depth, picture in enumerate(pictures(figure)):
-        assert picture.max() == pytest.approx(1.0)
-        assert picture[5, 5].tolist() == pytest.approx([float(c == depth) for c in range(3)])
-    peaks = [axes.get_title().partition("\n")[2] for axes in figure.axes]
-    assert peaks == ["peak 1", "peak 0.11", "peak 0.012"]
-
-
-def test_psfs_are_encoded_for_display():
-    psfs = spots()
-    psfs[2, :, 20, 20] *= 2.0
-    picture = pictures(psf_figure(psfs, "abc", 0.01))[2]
-    assert picture[5, 6, 2] == pytest.approx(0.735357, abs=1e-5)  # sRGB of one half
-
-
-def test_the_scale_bar_is_as_long_as_it_says():
-    axes = psf_figure(spots(), "abc", 0.00345).axes[0]
-    (bar,) = axes.get_lines()
-    assert 11.0 * 3.45 * np.ptp(bar.get_xdata()) == pytest.approx(10.0)
-    assert texts(axes) == ["10 µm"]
-
-
-def test_a_dark_psf_is_black_and_many_depths_wrap():
-    figure = psf_figure(torch.zeros(8, 3, 9, 9), "abcdefgh", 0.01)
-    assert len(figure.axes) == 8
-    assert all(picture.max() == 0.0 for picture in pictures(figure))
-    rows = {axes.get_subplotspec().rowspan.start for axes in figure.axes}
-    assert rows == {0, 1}
-
-
-@pytest.mark.parametrize("shape", [(3, 9, 9), (2, 1, 9, 9), (2, 3, 9, 8), (3, 3, 9, 9)])
-def test_psfs_of_another_shape_are_refused(shape):
-    with pytest.raises(InputError):
-        psf_figure(torch.ones(shape), ["a", "b"], 0.01)
 
 
 def images(depths=2, height=12, width=16):
@@ -129,3 +67,84 @@ def test_comparison_refuses_what_does_not_match():
         comparison_figure(truth[:, 1:], raw, restored, "ab")
     with pytest.raises(InputError, match="labels"):
         comparison_figure(truth, raw, restored, "abc")
+
+
+def test_pictures_of_a_camera():
+    image = torch.rand(3, 24, 24)
+    views = image.expand(3, 3, 24, 24)
+    psnr = {"raw": [20.0] * 3, "restored": [25.0] * 3}
+    figure = comparison_figure(image, views, views, ["8 m", "6 m", "4.5 m"], psnr, "Title\nbelow")
+    assert not flaws(figure)
+
+
+def test_images_of_sources_are_not_clipped():
+    measured, initial = torch.zeros(2, 1, 40, 40)
+    measured[0, 10:30, 12:28], initial[0, 14:26, 14:26] = 1.0, 3.0
+    figure = spot_fit_figure(measured, initial, measured, ["10°"], 0.05, "Title")
+    assert not flaws(figure)
+    panels = [axes.images[0] for axes in figure.axes if axes.images][:3]
+    assert {panel.norm.gamma for panel in panels} == {1.0}
+    brightest = max(float(panel.get_array().max()) for panel in panels)
+    assert [panel.get_clim()[1] for panel in panels] == pytest.approx([brightest] * 3)
+
+
+def test_light_around_a_focus_is_seen():
+    """A disc of 1 % of the brightest pixel, a tenth up the colours by its root."""
+    image = torch.zeros(1, 40, 40)
+    image[0, 10:30, 10:30], image[0, 20, 20] = 0.01, 1.0
+    figure = spot_fit_figure(image, image, image, ["0°"], 0.05, "Title")
+    assert not flaws(figure)
+    panel = next(axes.images[0] for axes in figure.axes if axes.images)
+    assert float(panel.norm(0.01)) == pytest.approx(0.1)
+    assert any("square-root scale" in axes.get_ylabel() for axes in figure.axes)
+
+
+def spot(row, column, radius, size=60):
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    light = ((rows - row) ** 2 + (columns - column) ** 2 <= radius**2).double()
+    return light / light.sum()
+
+
+def test_rows_show_measured_initial_final_and_what_is_left_over():
+    measured = torch.stack([spot(20, 30, 5), spot(40, 40, 8)])
+    initial = torch.stack([spot(25, 32, 3), spot(38, 40, 6)])
+    final = torch.stack([spot(20, 30, 5), spot(40, 41, 8)])
+    figure = spot_fit_figure(measured, initial, final, ["near", "far"], 0.1, "Title")
+    panels = [axes for axes in figure.axes if axes.images]
+    bars = [axes for axes in figure.axes if not axes.images]
+    assert (len(panels), len(bars)) == (8, 4)
+    assert [panels[0].get_ylabel(), panels[4].get_ylabel()] == ["near", "far"]
+    pictures = [axes.images[0].get_array() for axes in panels]
+    # Cropped, but no light of any of the three is lost, nor moved.
+    assert pictures[0].shape[0] < 25
+    assert len({picture.shape for picture in pictures[:4]}) == 1
+    for number, images in enumerate((measured, initial, final)):
+        share = float(pictures[4 + number].sum() * measured[1].max())
+        assert share == pytest.approx(1.0), images
+    assert not pictures[3].any()
+    assert np.allclose(pictures[7], 100.0 * (pictures[6] - pictures[4]))
+    low, high = panels[7].images[0].get_clim()
+    assert -low == high == pytest.approx(100.0)
+    (bar,) = panels[0].get_lines()
+    length = float(np.ptp(bar.get_xdata())) * pictures[0].shape[1] * 0.1
+    assert panels[0].texts[-1].get_text().startswith(f"{length:g} mm")
+    figure.draw_without_rendering()
+
+
+def test_images_that_do_not_fit_or_have_no_light_are_refused():
+    image = spot(20, 30, 5)[None]
+    with pytest.raises(InputError, match="2 labels"):
+        spot_fit_figure(image, image, image, ["a", "b"], 0.1)
+    with pytest.raises(InputError, match="no light"):
+        spot_fit_figure(0.0 * image, image, image, ["a"], 0.1)
+    # A model whose light misses the sensor is worth a picture.
+    spot_fit_figure(image, 0.0 * image, image, ["a"], 0.1).draw_without_rendering()
+
+
+def test_images_on_several_planes_name_their_plane():
+    """One source on three planes, once labelled as three sources; a source's images together."""
+    assert image_labels(1, [0.0]) == [""]
+    assert image_labels(1, [0.0, -8.0]) == ["\nplane 0 mm", "\nplane −8 mm"]
+    assert image_labels(2, [0.0]) == [", source 1", ", source 2"]
+    both = image_labels(2, [0.0, 4.5])
+    assert both[1:3] == [", source 1\nplane 4.5 mm", ", source 2\nplane 0 mm"]

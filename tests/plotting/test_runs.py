@@ -4,6 +4,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dolens.plotting import RunPoint, runs_curve, runs_figure
+from dolens.plotting.runs import Curve, quality_figure
+from tests.plotting.artists import legend
 
 SEEDS = RunPoint(25.0, (24.5, 25.5))
 SINGLE = RunPoint(26.0, (26.0,), 25.0, 27.5)
@@ -42,8 +44,7 @@ def test_a_setting_over_decades_is_drawn_logarithmically(values, scale):
 
 def test_several_lines_have_a_legend():
     figure = runs_curve({"unet": [(1.0, SEEDS)], "wiener": [(1.0, SINGLE)]}, "x", "y")
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["unet", "wiener"]
+    assert legend(figure) == ["unet", "wiener"]
 
 
 def test_long_labels_are_broken_and_stay_within_the_figure():
@@ -53,3 +54,16 @@ def test_long_labels_are_broken_and_stay_within_the_figure():
     (text,) = figure.axes[0].get_yticklabels()
     assert text.get_text().endswith("…") and "\n" in text.get_text()
     assert text.get_window_extent().x0 >= 0.0
+
+
+def test_every_network_has_a_line_with_its_intervals():
+    found = [
+        Curve("one", [20.0, 70.0], [22.0, 23.0], [21.0, 22.5], [23.0, 23.5]),
+        Curve("other", [20.0], [24.0], [23.0], [25.0]),
+    ]
+    figure = quality_figure(found)
+    (axes,) = figure.axes
+    assert len(axes.containers) == 2
+    assert legend(figure) == ["one", "other"]
+    low, high = axes.get_ylim()
+    assert low < 21.0 and high > 25.0

@@ -1,3 +1,5 @@
+"""Tolerances: matrices, yields and worst offenders."""
+
 import math
 
 import pytest
@@ -11,6 +13,7 @@ from dolens.plotting.tolerances import (
     tolerance_label,
     yield_figure,
 )
+from tests.plotting.overlaps import flaws
 
 
 def test_a_matrix_keeps_its_numbers_rows_and_columns():
@@ -72,3 +75,18 @@ def test_tolerances_are_printed_with_their_units():
     assert tolerance_label("elements.front.tilt_x", "± 0.05°") == "front tilt x, ±0.05°"
     assert tolerance_label("surfaces.3.curvature", "± 0.1 %") == "curvature 3, ±0.1 %"
     assert tolerance_label("surfaces.3.curvature", "± 1e-05 1/mm") == "curvature 3, ±10⁻⁵ 1/mm"
+
+
+def test_tolerances():
+    rows, names = (
+        [f"(0, {n})°  588 nm" for n in range(6)],
+        [f"tilt {n}  ± 0.05°" for n in range(9)],
+    )
+    matrix = torch.randn(6, 9)
+    figure = matrix_figure({"motion (µm)": (matrix, names)}, rows, [("x", 3), ("y", 3)], "Title")
+    assert not flaws(figure)
+    radii = torch.linspace(0.01, 0.02, 100)
+    panels = {"RMS radius": {"Monte Carlo": radii, "linear": radii * 1.01}}
+    assert not flaws(yield_figure(panels, {"RMS radius": 0.011}, "Title"))
+    bars = offenders_figure(names, [0.1] * 9, {"refocused": [1e-3] * 9, "not": [2e-3] * 9}, "Title")
+    assert not flaws(bars)

@@ -1,3 +1,5 @@
+"""Convergence of a fit, and the covariance of what it found."""
+
 import math
 
 import numpy as np
@@ -6,9 +8,8 @@ import torch
 from matplotlib.patches import Ellipse
 
 from dolens.errors import InputError
-from dolens.experiments.poses.pose_figures import image_labels
 from dolens.plotting.parameter_fits import convergence_figure, corner_figure
-from dolens.plotting.pictures import spot_fit_figure
+from tests.plotting.overlaps import flaws
 
 COVARIANCE = torch.tensor([[4.0, 1.0, -0.5], [1.0, 1.0, 0.2], [-0.5, 0.2, 9.0]])
 LABELS, UNITS = ["a", "b", "c"], ["mm", "mm", "deg"]
@@ -16,48 +17,6 @@ LABELS, UNITS = ["a", "b", "c"], ["mm", "mm", "deg"]
 
 def ellipses(axes):
     return [patch for patch in axes.patches if isinstance(patch, Ellipse)]
-
-
-def spot(row, column, radius, size=60):
-    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
-    light = ((rows - row) ** 2 + (columns - column) ** 2 <= radius**2).double()
-    return light / light.sum()
-
-
-def test_rows_show_measured_initial_final_and_what_is_left_over():
-    measured = torch.stack([spot(20, 30, 5), spot(40, 40, 8)])
-    initial = torch.stack([spot(25, 32, 3), spot(38, 40, 6)])
-    final = torch.stack([spot(20, 30, 5), spot(40, 41, 8)])
-    figure = spot_fit_figure(measured, initial, final, ["near", "far"], 0.1, "Title")
-    panels = [axes for axes in figure.axes if axes.images]
-    bars = [axes for axes in figure.axes if not axes.images]
-    assert (len(panels), len(bars)) == (8, 4)
-    assert [panels[0].get_ylabel(), panels[4].get_ylabel()] == ["near", "far"]
-    pictures = [axes.images[0].get_array() for axes in panels]
-    # Cropped, but no light of any of the three is lost, nor moved.
-    assert pictures[0].shape[0] < 25
-    assert len({picture.shape for picture in pictures[:4]}) == 1
-    for number, images in enumerate((measured, initial, final)):
-        share = float(pictures[4 + number].sum() * measured[1].max())
-        assert share == pytest.approx(1.0), images
-    assert not pictures[3].any()
-    assert np.allclose(pictures[7], 100.0 * (pictures[6] - pictures[4]))
-    low, high = panels[7].images[0].get_clim()
-    assert -low == high == pytest.approx(100.0)
-    (bar,) = panels[0].get_lines()
-    length = float(np.ptp(bar.get_xdata())) * pictures[0].shape[1] * 0.1
-    assert panels[0].texts[-1].get_text().startswith(f"{length:g} mm")
-    figure.draw_without_rendering()
-
-
-def test_images_that_do_not_fit_or_have_no_light_are_refused():
-    image = spot(20, 30, 5)[None]
-    with pytest.raises(InputError, match="2 labels"):
-        spot_fit_figure(image, image, image, ["a", "b"], 0.1)
-    with pytest.raises(InputError, match="no light"):
-        spot_fit_figure(0.0 * image, image, image, ["a"], 0.1)
-    # A model whose light misses the sensor is worth a picture.
-    spot_fit_figure(image, 0.0 * image, image, ["a"], 0.1).draw_without_rendering()
 
 
 def test_stages_part_where_the_optimizer_changes_and_errors_are_against_the_truth():
@@ -142,10 +101,27 @@ def test_a_covariance_of_another_shape_or_without_spread_is_refused():
         corner_figure(0.0 * COVARIANCE, LABELS, UNITS)
 
 
-def test_images_on_several_planes_name_their_plane():
-    """One source on three planes, once labelled as three sources; a source's images together."""
-    assert image_labels(1, [0.0]) == [""]
-    assert image_labels(1, [0.0, -8.0]) == ["\nplane 0 mm", "\nplane −8 mm"]
-    assert image_labels(2, [0.0]) == [", source 1", ", source 2"]
-    both = image_labels(2, [0.0, 4.5])
-    assert both[1:3] == [", source 1\nplane 4.5 mm", ", source 2\nplane 0 mm"]
+def test_a_fit_of_many_variables():
+    count = 30
+    values = {f"source {n} z": ([1.0 / (k + n + 1) for k in range(count)], "mm") for n in range(9)}
+    values["tilt"] = ([2.0 / (k + 1) for k in range(count)], "deg")
+    losses = {"loss S21 (no unit)": [1.0 / (k + 1) for k in range(count)]}
+    truth = dict.fromkeys(values, 0.0)
+    figure = convergence_figure(losses, values, [("adam", 20), ("dls", 10)], truth, "Title")
+    assert not flaws(figure)
+    # Errors in mm, after the loss.
+    lines = [line for line in figure.axes[1].get_lines() if line.get_label().startswith("source")]
+    looks = {
+        (line.get_color(), str(line.get_linestyle()), line._unscaled_dash_pattern) for line in lines
+    }
+    assert len(looks) == 9
+
+
+def test_values_have_the_digits_that_their_deviations_allow():
+    covariance = torch.diag(torch.tensor([3.3**2, 5.5e-3**2, 0.16**2]))
+    centre = torch.tensor([-666.725, 119.45, 0.0])
+    figure = corner_figure(covariance, ["z", "distance", "x"], ["mm", "mm", "deg"], centre)
+    grid = np.array(figure.axes).reshape(3, 3)
+    texts = [grid[n, n].texts[0].get_text() for n in range(3)]
+    assert texts == ["z\n−667\n± 3 mm", "distance\n119.450\n± 0.005 mm", "x\n0.00\n± 0.16°"]
+    assert not [flaw for flaw in flaws(figure) if "unit" not in flaw]

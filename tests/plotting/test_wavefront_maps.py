@@ -4,21 +4,16 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from dolens import load_lens
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.footprint import footprint
 from dolens.diffraction.point_spread import strehl_ratios
 from dolens.diffraction.wavefront_map import wavefront_maps
 from dolens.plotting.footprint import footprint_figure
 from dolens.plotting.wavefront_maps import strehl_figure, wavefront_maps_figure, zernike_figure
+from tests.plotting.artists import by_gid
 from tests.plotting.overlaps import flaws
 
 FIELDS = [(0.0, 0.0), (0.0, 20.0), (0.0, 45.0)]
-
-
-@pytest.fixture(scope="module")
-def triplet(root):
-    return load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +66,7 @@ def test_footprints_have_a_panel_for_each_surface_and_its_outline(triplet):
     figure = footprint_figure(found)
     panels = [axes for axes in figure.axes if axes.get_visible()]
     assert len(panels) == 6
-    rays = [line for line in panels[3].lines if line.get_gid() == "rays"]
+    rays = by_gid(panels[3], "rays")
     assert [len(line.get_xdata()) for line in rays] == found.passes.sum(1).tolist()
     # The stop's edge, of 3.86 mm, is drawn where its margin is zero.
     (outline,) = panels[3].collections
