@@ -3,12 +3,10 @@
 import copy
 
 import pytest
-import torch
 
-from dolens import InputError, Rays
+from dolens import InputError
 from dolens.kernels.cpu.compiler import source_of
 from dolens.kernels.surface_kernel import SurfaceKernel, kernels_of
-from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.packing import unsupported
 from dolens.optics.surfaces import PackedShape, Shape
 from tests.kernels.own_surface.paraboloid import Paraboloid
@@ -16,8 +14,6 @@ from tests.kernels.trace_cases import (
     LENSES,
     bundle,
     require_equal,
-    require_no_worse,
-    returning,
     traced,
 )
 
@@ -25,34 +21,6 @@ from tests.kernels.trace_cases import (
 @pytest.fixture
 def lens(root):
     return LENSES["own_surface"](root)
-
-
-@pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_rays_and_gradients_are_those_of_the_reference(lens, sense):
-    rays = bundle(lens) if sense > 0.0 else returning(lens, bundle(lens))
-    expected = traced(lens, rays, "reference", sense)
-    assert (~expected.valid).sum() > 3, "some rays must fail"
-    require_equal(traced(lens, rays, "cpu", sense), expected)
-
-
-def test_single_precision_is_no_worse_than_the_reference(lens):
-    rays = bundle(lens, fill=0.9)
-    held = Rays(rays.position.float().double(), rays.direction.float().double(), 550.0)
-    lens = lens.float().double()
-    found = traced(lens, held, "cpu", dtype=torch.float32)
-    reference = traced(lens, held, "reference", dtype=torch.float32)
-    require_no_worse(found, reference, traced(lens, held, "reference"))
-
-
-def test_its_jacobian_is_that_of_the_reference(lens):
-    names, rays = ["surfaces.2.*", "thicknesses.1"], bundle(lens)
-    found = []
-    for backend in ("cpu", "reference"):
-        lens.backend = backend
-        found.append(ray_jacobian(lens, rays, names))
-    assert found[0].columns.keys() >= {"surfaces.2.twist"}
-    assert torch.equal(found[0].valid, found[1].valid)
-    assert (found[0].derivatives - found[1].derivatives).abs().max() < 1e-11
 
 
 def test_without_kernels_for_a_device_the_reference_traces(lens, monkeypatch):

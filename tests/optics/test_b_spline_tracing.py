@@ -76,16 +76,6 @@ def test_a_spline_that_is_a_polynomial_traces_like_it(name):
         assert first[0] == pytest.approx(first[1], rel=1e-9)
 
 
-def test_backward_rays_return_on_themselves():
-    lens, rays = spline_singlet(KNOTS["clamped"], KNOTS["repeated"]), pencil()
-    with torch.no_grad():
-        there = lens.trace(rays, record=True)
-        back = lens.sensor_to_scene(Rays(there.position, -there.direction))
-    assert back.valid.all()
-    assert (back.position - there.points[0]).abs().max() < 1e-12
-    assert (back.direction + rays.direction).abs().max() < 1e-13
-
-
 def test_float32_is_off_by_its_own_rounding():
     """Sensor points within 10 nm, and slopes within 2e-7 though the knots are 0.06 mm apart."""
     knots = clamped_knots(5.0, 160)

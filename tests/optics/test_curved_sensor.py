@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, load_lens
-from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.rays import Status
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.kernels.trace_cases import LENSES, bundle
@@ -84,31 +83,6 @@ def test_the_intersection_is_that_of_80_digits(name, root):
     assert compared > 8
 
 
-@pytest.mark.parametrize("backend", ["auto", "reference"])
-@pytest.mark.parametrize("name", ["retina", "folded_film"])
-def test_every_derivative_is_that_of_differences(name, backend, root):
-    """Columns of the Jacobian of the sensor's own parameters, and of a surface in front."""
-    lens = LENSES[name](root)
-    rays = bundle(lens, 200, fill=0.6)
-    kept = lens.trace(rays).valid
-    rays = Rays(rays.position[kept], rays.direction[kept], 550.0)
-    lens.backend = backend
-    names = [n for n, _ in lens.named_parameters() if n.startswith("sensor")]
-    names.append("surfaces.2.curvature")
-    found = ray_jacobian(lens, rays, names, ("x", "y", "path_length"))
-    assert found.valid.all()
-    for name, columns in found.columns.items():
-        ends, step = [], 1e-3 if name == "sensor_conic" else 1e-5
-        for k in (-2, -1, 1, 2):
-            value = lens.variables([name])[name].detach() + k * step
-            hit = torch.func.functional_call(lens, {name: value}, (rays,))
-            ends.append(torch.cat((hit.position[:, :2], hit.path_length[:, None]), -1).detach())
-        difference = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-        derivative = found.derivatives[..., columns.start]
-        assert derivative.abs().max() > 1e-3, name
-        assert (derivative - difference).abs().max() < 1e-8 * derivative.abs().max(), name
-
-
 def test_a_parabola_collects_its_own_focal_plane():
     """On the paraboloid z = -y²/4f' a ray parallel to the axis at height h lands at that height."""
     lens = mirror(sensor={"distance": -60.0, "radius": 80.0, "conic": -1.0})
@@ -127,17 +101,6 @@ def test_rays_beyond_the_rim_miss_the_sensor():
     assert hit.status[0] == Status.OK
     assert far.status[0] == Status.MISSED and far.surface[0] == 3
     assert torch.isfinite(far.position).all() and torch.isfinite(far.path_length).all()
-
-
-def test_light_goes_back_from_anywhere(root):
-    """Backward rays from the curved sensor return along the forward ones."""
-    lens = LENSES["retina"](root)
-    rays = bundle(lens, 50, fill=0.5)
-    hit = lens.trace(rays)
-    back = lens.sensor_to_scene(Rays(hit.position, -hit.direction, 550.0))
-    ok = hit.valid & back.valid
-    assert ok.sum() > 20
-    assert (back.direction + rays.direction)[ok].abs().max() < 1e-12
 
 
 def test_a_plane_has_no_further_parameters_and_the_same_numbers(root):

@@ -1,15 +1,21 @@
-"""Catalogue glasses: the makers' printed indices, ranges, names."""
+"""Catalogue glasses: the makers' printed indices, ranges, names, and the user's own folders."""
 
 import mpmath
 import pytest
 import torch
 
-from dolens import InputError
-from dolens.optics.glass_catalog import FURTHER, MAKERS, find_glass, table
+from dolens import InputError, load_lens, save_lens
+from dolens.optics.glass_catalog import (
+    FURTHER,
+    MAKERS,
+    catalogues,
+    find_glass,
+    glass_folders,
+    table,
+)
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
 
 LINES = {"C": 656.2725, "d": 587.5618, "e": 546.0740, "F": 486.1327, "g": 435.8343}
-
 # As printed in the makers' catalogue tables: Schott (2018-06-01), Ohara (2018), Hoya (2018-12-15),
 # CDGM (2018-09), Sumita (version 12, 2020-07-02), Hikari (2020-04-01): nC, nd, ne, nF, ng.
 PUBLISHED = {
@@ -65,15 +71,6 @@ def test_coefficients_are_the_catalogues():
             square = (mpmath.mpf(wavelength) / 1000) ** 2
             index = mpmath.sqrt(1 + sum(b * square / (square - c) for b, c in printed))
             assert abs(glass.index(wavelength) - index) < 4e-16
-
-
-@pytest.mark.parametrize(
-    ("name", "nd"),
-    # Handbook of Optics, vol. II; Zeon's data sheet.  Batches differ in the third decimal.
-    [("PMMA", 1.4918), ("POLYCARBONATE", 1.5855), ("polystyr", 1.5905), ("ZEONEX-E48R", 1.531)],
-)
-def test_plastics(name, nd):
-    assert abs(index_d(find_glass(name)) - nd) < 2e-3
 
 
 def test_a_number_a_tensor_and_their_slopes():
@@ -202,21 +199,15 @@ def test_indices_are_relative_to_the_model_s_air(model):
 
 
 # Robb and Mercado, Applied Optics 22 (1983) 1198, of Schott's glasses then.
-OLD = {"BK7": 1.5168, "SK16": 1.62041, "SF6": 1.80518, "F6": 1.63636, "BAFN10": 1.67003,
-       "LAKN7": 1.6516, "SK4": 1.61272, "KF9": 1.52341, "LASFN31": 1.88067, "K50": 1.52257,
-       "PSK3": 1.55232, "SSK4A": 1.61765, "F15": 1.60565, "LAK11": 1.65830}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", OLD)
-def test_glasses_that_schott_no_longer_makes(name):
-    assert index_d(find_glass(f"SCHOTT:{name}")) == pytest.approx(OLD[name], abs=1e-5)
 
 
 @pytest.mark.parametrize(
     ("name", "meant"),
     [("BK7", "SCHOTT"), ("K7", "SCHOTT"), ("B270", "SCHOTT"), ("F_SILICA", "MISC"),
      ("WATER", "MISC"), ("CAF2", "MISC"), ("GERMANIUM", "INFRARED"), ("AQUEOUS", "EYE"),
-     ("VACUUM", "MISC"), ("LZ_K8", "LZOS"), ("PMMA", "PLASTIC"), ("SAPPHIRE", "INFRARED")],
+     ("VACUUM", "MISC"), ("LZ_K8", "LZOS"), ("PMMA", "PLASTIC"), ("SAPPHIRE", "INFRARED"),
+     ("SF57", "SCHOTT"), ("KZFSN4", "SCHOTT"), ("N-BK7", "SCHOTT"), ("S-BSL7", "OHARA"),
+     ("H-K9L", "CDGM"), ("FCD1", "HOYA")],
 )  # fmt: skip
 def test_a_bare_name_means_its_only_glass(name, meant):
     assert find_glass(name).name == f"{meant}:{name}"
@@ -228,6 +219,16 @@ FLAT = ("MISC:N15", "MISC:VACUUM")
 # (1976), germanium and silicon; Malitson (1963), calcium fluoride; Dodge (1984), magnesium
 # fluoride; Schott's data sheet of B 270 (1993).
 MEDIA = {
+    # Robb and Mercado, Applied Optics 22 (1983) 1198, of Schott's glasses then.
+    *((f"SCHOTT:{name}", 587.5618, index, 1e-5) for name, index in (
+        ("BK7", 1.5168), ("SK16", 1.62041), ("SF6", 1.80518), ("F6", 1.63636), ("BAFN10", 1.67003),
+        ("LAKN7", 1.6516), ("SK4", 1.61272), ("KF9", 1.52341), ("LASFN31", 1.88067),
+        ("K50", 1.52257), ("PSK3", 1.55232), ("SSK4A", 1.61765), ("F15", 1.60565),
+        ("LAK11", 1.65830))),
+    # Handbook of Optics, vol. II; Zeon's data sheet.  Batches differ in the third decimal.
+    *((name, 587.5618, index, 2e-3) for name, index in (
+        ("PMMA", 1.4918), ("POLYCARBONATE", 1.5855), ("polystyr", 1.5905),
+        ("ZEONEX-E48R", 1.531))),
     ("MISC:F_SILICA", 587.5618, 1.45846, 1e-5),
     ("MISC:SILICA", 656.2725, 1.45637, 1e-5),
     ("MISC:WATER", 589.3, 1.33299, 1e-4),
@@ -238,11 +239,11 @@ MEDIA = {
     ("INFRARED:MGF2", 587.5618, 1.37774, 1e-5),
     ("SCHOTT:B270", 587.5618, 1.5230, 1e-4),
     ("MISC:VACUUM", 587.5618, 1 / 1.000272, 2e-6),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "wavelength", "index", "error"), sorted(MEDIA))
-def test_media_that_are_no_glass(name, wavelength, index, error):
+def test_indices_of_old_glasses_plastics_and_other_media(name, wavelength, index, error):
     assert find_glass(name).index(wavelength) == pytest.approx(index, abs=error)
 
 
@@ -259,13 +260,6 @@ def test_an_old_name_of_schott_s_is_no_other_maker_s_glass(name):
 def test_what_schott_has_instead_is_said():
     with pytest.raises(InputError, match=r"did you mean .*'SSK4A'"):
         find_glass("SCHOTT:SSK4")
-
-
-@pytest.mark.parametrize(
-    "name", ["SF57", "KZFSN4", "N-BK7", "S-BSL7", "H-K9L", "FCD1", "ZF6", "PMMA", "LAF09", "BSC7"]
-)
-def test_a_name_that_one_maker_uses_needs_no_maker(name):
-    assert find_glass(name).name.endswith(f":{name}")
 
 
 @pytest.mark.parametrize("maker", MAKERS + FURTHER)
@@ -285,3 +279,77 @@ def test_every_digit_that_a_maker_prints():
     """Makers print up to nine digits; the tables hold them all, single precision holds seven."""
     assert find_glass("HIKARI:J-KZFH9").terms[3] == (0.000700950165, -4.0)
     assert find_glass("SCHOTT:N-SF6").terms[2] == (2.08734474, 174.01759)
+
+
+# A glass of constant index, and another by a maker's name with the maker's own coefficients.
+OWN = "NM GLASS1 5 0 1.7 0\nED 12.5 0 0 0 0\nCD 1.7 0 0\nTD 1E-6 0 0 0 0 0 20\nLD 0.4 0.7\n"
+MELT = "NM N-BK7 5 0 1.6 0\nCD 1.6 0 0\nLD 0.4 0.7\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    place = tmp_path / "glass"
+    place.mkdir()
+    (place / "special.agf").write_text(OWN)
+    (place / "Notes.txt").write_text("no catalogue")
+    return place
+
+
+def test_the_environment_names_folders(folder, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="no maker 'SPECIAL'"):
+        find_glass("SPECIAL:GLASS1")
+    monkeypatch.setenv("DOLENS_GLASS", f"{tmp_path}:{folder}")
+    for name in ("SPECIAL:GLASS1", "special:glass1", "GLASS1"):
+        glass = find_glass(name)
+        assert glass.name == "SPECIAL:GLASS1" and glass.index(550.0) == 1.7
+    assert glass.expansion == pytest.approx(12.5e-6) and glass.thermal.d0 == 1e-6
+    assert "SPECIAL" in catalogues() and "NOTES" not in catalogues()
+
+
+def test_a_file_of_a_maker_s_name_is_asked_first(folder):
+    (folder / "Schott.AGF").write_text(MELT)
+    with glass_folders(folder):
+        assert find_glass("N-BK7").index(550.0) == find_glass("SCHOTT:N-BK7").index(550.0) == 1.6
+        assert find_glass("BK7").name == "SCHOTT:BK7"
+    assert find_glass("N-BK7").index(550.0) == pytest.approx(1.5185, abs=1e-4)
+
+
+def test_an_edited_catalogue_is_read_again(folder):
+    with glass_folders(folder):
+        assert find_glass("GLASS1").index(550.0) == 1.7
+        (folder / "special.agf").write_text(OWN.replace("CD 1.7 0 0", "CD 1.75 0 0"))
+        assert find_glass("GLASS1").index(550.0) == 1.75
+
+
+LENS = """name: Own glass
+surfaces:
+  '1': {radius: 50, semi_diameter: 5, thickness: 4, material: 'SPECIAL:GLASS1'}
+  '2': {radius: -50, semi_diameter: 5, material: air}
+sensor: {distance: 40}
+"""
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".zmx"])
+def test_a_lens_of_such_glass_is_read_and_written(folder, tmp_path, suffix):
+    (tmp_path / "first.yaml").write_text(LENS)
+    with pytest.raises(InputError, match="surface 1: unknown material 'SPECIAL:GLASS1'"):
+        load_lens(tmp_path / "first.yaml")
+    lens = load_lens(tmp_path / "first.yaml", glass_catalogues=folder)
+    path = tmp_path / f"second{suffix}"
+    save_lens(lens, path, glass_catalogues=[folder / "special.agf"])
+    again = load_lens(path, glass_catalogues=[folder])
+    assert again.materials == lens.materials
+    if suffix == ".zmx":
+        assert "GCAT SPECIAL" in path.read_text()
+
+
+def test_what_is_wrong_is_said_in_one_line(folder, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"glass catalogues: '.*nowhere' is no folder"):
+        load_lens("cooke_triplet", glass_catalogues=tmp_path / "nowhere")
+    (folder / "broken.agf").write_bytes(b"NM\0" + bytes(range(256)))
+    with glass_folders(folder), pytest.raises(InputError, match=r"broken\.agf: is no text") as e:
+        find_glass("GLASS1")
+    assert "\n" not in str(e.value)
+    monkeypatch.setenv("DOLENS_GLASS", str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match=r"DOLENS_GLASS: '.*nowhere' is no folder and no file"):
+        find_glass("N-BK7")

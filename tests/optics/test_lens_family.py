@@ -1,4 +1,4 @@
-"""Many lenses of one structure are traced and differentiated as each of them alone."""
+"""Many lenses of one structure are traced and differentiated as each alone, and by parts."""
 
 import copy
 
@@ -9,7 +9,13 @@ from torch.func import vmap
 import dolens
 from dolens import Rays
 from dolens.optics.jacobian import normal_equations, ray_jacobian
-from dolens.optics.lens_family import FamilyRays, LensFamily
+from dolens.optics.lens_family import (
+    FamilyRays,
+    LensFamily,
+    intercept_parts,
+    jacobian_parts,
+    shared_rays,
+)
 from dolens.optics.ray_tracing import trace_rays
 from dolens.tolerancing.tolerances import with_glass_elements
 
@@ -255,3 +261,54 @@ def test_indices_vary_beside_poses():
     scale = found[1].abs().amax((0, 3), keepdim=True)
     assert float(scale.min()) > 0.0
     torch.testing.assert_close(found[0] / scale, found[1] / scale, rtol=0.0, atol=1e-4)
+
+
+PARTS, FEW = 7, 50
+KINDS = {
+    "records that are one sum": ["surfaces.*.curvature", "sensor_distance"],
+    "poses": ["elements.*.tilt_x", "elements.*.decenter_y", "thicknesses.2"],
+}
+
+
+@pytest.fixture(scope="module")
+def shared_bundle():
+    """Some of them miss or are clipped: the beam is wider than the lens."""
+    generator = torch.Generator().manual_seed(1)
+    position = 6.0 * torch.randn(FEW, 3, generator=generator, dtype=torch.float64)
+    position[:, 2] = -10.0
+    direction = torch.tensor([0.0, 0.1, 1.0], dtype=torch.float64)
+    wavelength = torch.tensor([656.2725, 486.1327], dtype=torch.float64)[torch.arange(FEW) % 2]
+    return Rays(position, (direction / direction.norm()).expand(FEW, 3), wavelength)
+
+
+@pytest.mark.parametrize("size", [1, 3, PARTS, 100])
+@pytest.mark.parametrize("kind", KINDS)
+def test_parts_are_what_the_whole_is(shared_bundle, kind, size):
+    lens = with_glass_elements(dolens.load_lens("cooke_triplet", dtype=torch.float64))
+    wavelengths, shared = shared_rays(shared_bundle)
+    assert wavelengths == (486.1327, 656.2725)
+    family = LensFamily(lens, KINDS[kind], wavelengths)
+    generator = torch.Generator().manual_seed(2)
+    off = torch.randn(PARTS, family.count, generator=generator, dtype=torch.float64)
+    values = family.start + 1e-3 * off
+    traced = family.trace(values, shared.of_each(PARTS))
+    expected = family.jacobians(values, shared.of_each(PARTS))
+    seen = []
+    for rows, points, arrives in intercept_parts(family, values, shared, size):
+        assert torch.equal(points, traced.position[rows, :, :2])
+        assert torch.equal(arrives, traced.status[rows] <= 1)
+        seen += range(PARTS)[rows]
+    assert seen == list(range(PARTS)) and 0 < int(traced.valid.sum()) < PARTS * FEW
+    for rows, found in jacobian_parts(family, values, shared, size):
+        assert torch.equal(found.valid, expected.valid[rows])
+        torch.testing.assert_close(found.values, expected.values[rows], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            found.derivatives, expected.derivatives[rows], rtol=1e-12, atol=1e-10
+        )
+
+
+def test_a_family_of_no_lens_has_no_parts(shared_bundle):
+    lens = dolens.load_lens("cooke_triplet", dtype=torch.float64)
+    wavelengths, shared = shared_rays(shared_bundle)
+    family = LensFamily(lens, ["sensor_distance"], wavelengths)
+    assert not list(intercept_parts(family, family.start.expand(0, -1), shared, 3))

@@ -7,11 +7,9 @@ import torch
 
 from dolens import Rays, Status
 from dolens.errors import InputError
-from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.paraxial_rays import ParaxialNumbers
-from dolens.optics.ray_tracing import trace_rays
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from tests.kernels.trace_cases import LENSES, bundle
+from tests.kernels.trace_cases import LENSES
 
 F64 = torch.float64
 
@@ -188,88 +186,6 @@ def test_a_ray_beside_a_mirror_and_one_that_it_sends_away(backend):
     assert hit.status.tolist() == [Status.MISSED, Status.MISSED, Status.MISSED, Status.OK]
     # At 45° and more of incidence the light goes on forwards, and never comes to the sensor.
     assert hit.surface.tolist() == [1, 2, 2, 0]
-
-
-@pytest.mark.parametrize("name", ["mirrors", "folded"])
-def test_light_goes_back_the_way_it_came(name):
-    lens = LENSES[name](None)
-    rays = bundle(lens, 200)
-    for backend in ("reference", "cpu"):
-        lens.backend = backend
-        hit = lens.trace(rays)
-        ok = hit.valid
-        back = lens.sensor_to_scene(Rays(hit.position[ok], -hit.direction[ok], 550.0))
-        assert back.valid.all()
-        assert (back.direction + rays.direction[ok]).abs().max() < 1e-13
-        away = back.position - rays.position[ok]
-        across = away - (away * rays.direction[ok]).sum(-1, keepdim=True) * rays.direction[ok]
-        assert across.abs().max() < 1e-11
-
-
-@pytest.mark.parametrize("name", ["mirrors", "folded"])
-def test_derivatives_are_differences(name):
-    """Of every parameter: autograd, and the columns of Jacobians in both implementations."""
-    lens = LENSES[name](None)
-    rays = bundle(lens, 24, 0.7)
-    names = [n for n, p in lens.named_parameters() if p.ndim == 0]
-    outputs = ("x", "y", "path_length")
-
-    def values(shifted=None, by=0.0):
-        given = {} if shifted is None else {shifted: lens.variables([shifted])[shifted] + by}
-        hit = trace_rays(lens.system(given).traced_by("reference"), rays)
-        return torch.stack((*hit.position.unbind(-1)[:2], hit.path_length), -1), hit.valid
-
-    found = {}
-    for backend in ("reference", "cpu"):
-        lens.backend = backend
-        found[backend] = ray_jacobian(lens, rays, names, outputs)
-    valid = found["cpu"].valid
-    assert valid.sum() > 12 and torch.equal(valid, found["reference"].valid)
-    # A column that vanishes by symmetry is rounding of terms that do not.
-    scale = found["reference"].derivatives.abs().amax((0, 1)).clamp(min=1e-3)
-    both = (found["cpu"].derivatives - found["reference"].derivatives).abs().amax((0, 1))
-    assert (both / scale).max() < 1e-10
-    with torch.no_grad():
-        for name in names:
-            column = found["cpu"].derivatives[..., found["cpu"].columns[name].start]
-            size = float(column.abs().max())
-            # So that outputs move by 1e-3 mm at most.
-            h = min(1e-3 / size, 0.1) if size > 0.0 else 1e-4
-            difference = (values(name, h)[0] - values(name, -h)[0]) / (2.0 * h)
-            half = (values(name, 0.5 * h)[0] - values(name, -0.5 * h)[0]) / h
-            difference = (4.0 * half - difference) / 3.0
-            error = (difference - column)[valid].abs().max()
-            assert error <= 1e-6 * size + 1e-9, name
-
-
-@pytest.mark.parametrize("name", ["mirrors", "folded"])
-def test_normal_equations_are_the_same_in_both_implementations(name):
-    lens = LENSES[name](None)
-    rays = bundle(lens, 90, wavelengths=[[486.1327], [656.2725]])
-    names = [n for n, _ in lens.named_parameters()]
-    found = []
-    for backend in ("reference", "cpu"):
-        lens.backend = backend
-        found.append(normal_equations(lens, rays, names, outputs=("x", "y", "path_length")))
-    for what in ("jtj", "jtr"):
-        one, other = (getattr(f, what) for f in found)
-        assert (one - other).abs().max() <= 1e-9 * one.abs().max()
-    assert int(found[0].count) == int(found[1].count) > 0
-
-
-@pytest.mark.parametrize("name", ["mirrors", "folded"])
-def test_single_precision_follows_double(name):
-    lens = LENSES[name](None).float().double()
-    rays = bundle(lens, 300, 0.8)
-    held = Rays(rays.position.float().double(), rays.direction.float().double(), 550.0)
-    exact = lens.trace(held)
-    single = LENSES[name](None).float()
-    for backend in ("reference", "cpu"):
-        single.backend = backend
-        hit = single.trace(Rays(held.position.float(), held.direction.float(), 550.0))
-        both = hit.valid & exact.valid
-        assert both.sum() > 0.95 * exact.valid.sum()
-        assert (hit.position.double() - exact.position)[both].abs().max() < 3e-4
 
 
 def test_a_prescription_with_mirrors_is_written_as_it_was_read():

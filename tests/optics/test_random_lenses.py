@@ -8,12 +8,14 @@ import torch
 
 from dolens import Rays, Status
 from dolens.optics.jacobian import normal_equations, ray_jacobian
+from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.hard_cases import GLASS, surface
-from tests.optics.random_lenses import SAG_KINDS
+from tests.optics.random_lenses import KINDS, SAG_KINDS, random_lens
 from tests.optics.ray_agreement import any_cases, disagreements
 from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, chosen, send, violations
 
+EPSILON = torch.finfo(torch.float64).eps
 DTYPES = pytest.mark.parametrize("dtype", PRECISIONS, ids=["f32", "f64"])
 # Ordinary and wild by turns; each of these broke a rule once.
 NUMBERS = [1, 6, 9, 17, 20, 36, 53, 78, 105]
@@ -46,6 +48,62 @@ def test_backends_agree_on_any_prescription(number):
             found += disagreements(lens, rays, sense, dtype)
             broken = {rule for rule in found if "within rounding" not in rule}
             assert not broken, found
+
+
+@pytest.mark.parametrize("number", range(30))
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_directions_stay_unit_vectors_and_light_returns_the_way_it_came(backend, number):
+    """But where a small shift moves light far: near a tangent rounding has no bound."""
+    _, lens, rays, sense = next(cases(number, False, 64))
+    hit = send(lens, rays, sense, backend)
+    assert ((hit.direction[hit.valid].norm(dim=-1) - 1.0).abs() < 64 * EPSILON).all()
+    shifted = Rays(rays.position + 1e-7, rays.direction, rays.wavelength)
+    near = send(lens, shifted, sense, backend)
+    back = lens.sensor_to_scene(Rays(hit.position, -hit.direction, rays.wavelength))
+    # Total reflection and rims can fall either way within rounding; all else must return.
+    assert int((hit.valid & ~back.valid).sum()) <= 1
+    apart = (near.position - hit.position).norm(dim=-1) + (near.direction - hit.direction).norm(
+        dim=-1
+    )
+    held = hit.valid & back.valid & near.valid & (apart < 1e-5)
+    away = back.position - rays.position
+    across = away - (away * rays.direction).sum(-1, keepdim=True) * rays.direction
+    size = rays.position.norm(dim=-1) + hit.position.norm(dim=-1) + 1.0
+    assert (across.norm(dim=-1)[held] < 1e-9 * size[held]).all()
+    assert ((back.direction + rays.direction).norm(dim=-1)[held] < 1e-9).all()
+
+
+@pytest.mark.parametrize("number", range(30))
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_rays_that_meet_a_surface_end_on_it_and_obey_snell(number, sense):
+    """The normal is that of differences of the sag."""
+    lens, draw = random_lens(number, False, (*KINDS, *SAG_KINDS))
+    for shape in lens.surfaces.values():
+        p = {n: v.detach() for n, v in (*shape.named_parameters(), *shape.named_buffers())}
+        r = shape.semi_diameter
+        u, v = r * draw.numbers(2, 64)
+        direction = torch.cat((0.4 * draw.normal(2, 64), torch.full((1, 64), sense).double()))
+        l, m, n = direction / direction.norm(dim=0)  # noqa: E741
+        t, met = shape.intersect(p, PlaneRay(u, v, l, m, n), sense, r)
+        x, y, z = u + t * l, v + t * m, t * n
+        good = (x.hypot(y) < 0.9 * r) & (torch.ones(64) > 0.0 if met is None else met > 0.0)
+        sag = shape.sag_and_gradient(p, x, y)[0]
+        assert ((sag - z).abs()[good] < 64 * EPSILON * (t.abs() + r)[good]).all()
+        normal = torch.stack([c.expand_as(x) for c in shape.normal(p, x, y, z)])
+        assert ((normal.norm(dim=0) - 1.0).abs()[good] < 16 * EPSILON).all()
+        h = 1e-5 * r
+        for component, (dx, dy) in zip(normal, ((h, 0.0), (0.0, h)), strict=False):
+            ends = [shape.sag_and_gradient(p, x + k * dx, y + k * dy)[0] for k in (-2, -1, 1, 2)]
+            slope = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h)
+            error = (slope + component / normal[2]).abs()
+            assert (error[good] < 1e-8 * (1.0 + slope.abs())[good]).all()
+        bent = shape.refract(p, (x, y, z), (l, m, n), 1.0 / 1.5168, sense)
+        good, after = good & (bent.transmitted > 0.0), torch.stack(bent[:3])
+        # n sin i = n' sin i', in one plane: the tangential parts are parallel.
+        left = torch.linalg.cross(torch.stack((l, m, n)), normal, dim=0) / 1.5168
+        right = torch.linalg.cross(after, normal, dim=0)
+        assert ((left - right).abs().amax(0)[good] < 32 * EPSILON).all()
+        assert ((after * normal).sum(0)[good] * sense > 0.0).all()
 
 
 def test_a_ray_far_off_a_steep_asphere_has_no_gradient():

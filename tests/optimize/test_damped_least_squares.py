@@ -242,11 +242,6 @@ def test_a_jacobian_that_is_not_finite_is_refused():
         minimise(lambda u: torch.where(u > 0.0, u, (-u).sqrt()), (1.0,))
 
 
-def test_residuals_without_a_gradient_are_refused():
-    with pytest.raises(InputError, match="no gradient"):
-        minimise(lambda u: u.detach(), (1.0,))
-
-
 @pytest.mark.parametrize("count", [3, 200])
 def test_the_jacobian_of_few_and_of_many_residuals(count):
     """By reverse sweeps, and by forward ones where residuals are many: jacfwd's numbers."""

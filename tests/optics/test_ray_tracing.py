@@ -1,4 +1,4 @@
-"""Gradients against central differences in float64 and against the reference's exact ones."""
+"""Laws of tracing, for every kind of lens: derivatives, light that returns, rays that are lost."""
 
 import math
 
@@ -6,146 +6,98 @@ import pytest
 import torch
 
 from dolens import Rays, Status, load_lens
+from dolens.optics.jacobian import OUTPUTS, ray_jacobian
+from tests.kernels.trace_cases import LENSES, bundle
 
-pytestmark = pytest.mark.usefixtures("backend")
-
-
-def weighted(hit, valid=None):
-    """One number that every output of a trace goes into."""
-    count = hit.path_length.shape[-1]
-    weights = torch.linspace(0.7, 1.9, 7 * count, dtype=hit.position.dtype).reshape(count, 7)
-    values = torch.cat(
-        (hit.position[..., :2], hit.direction, hit.path_length[..., None] * 0.01), dim=-1
-    )
-    total = values * weights[:, :6]
-    return (total if valid is None else total[valid]).sum()
+BACKENDS = ("reference", "cpu")
+both = pytest.mark.usefixtures("backend")
 
 
-def finite_difference(function, parameter, step):
-    """Fourth-order central difference in one element."""
-    with torch.no_grad():
-        kept = parameter.clone()
-        ends = []
-        for k in (-2, -1, 1, 2):
-            parameter.copy_(kept + k * step)
-            ends.append(float(function()))
-        parameter.copy_(kept)
-    return (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
+def passing(lens):
+    """Rays that a lens lets through."""
+    rays = bundle(lens, 100, 0.6)
+    valid = lens.trace(rays).valid.nonzero()[:24, 0]
+    assert len(valid) > 12
+    return Rays(rays.position[valid], rays.direction[valid], 550.0)
 
 
-def step_for(name, lens):
-    """A step that moves the surface's edge by about a micrometre."""
-    if name.startswith("thicknesses") or name == "sensor_distance":
-        return 1e-3
-    _, number, key = name.split(".")
-    r = lens.surfaces[number].semi_diameter
-    if key == "curvature":
-        return 1e-3 / r**2
-    if key == "conic":
-        c = abs(float(lens.surfaces[number].curvature.detach()))
-        return 1e-2 / (c**3 * r**4)
-    if key == "b":
-        return 1e-3
-    power = int(key[1:]) if key[0] == "a" else sum(_powers(key))
-    return 1e-3 / r**power
+def outputs(hit):
+    """All numbers of a trace, (N, 7): position, direction, path length."""
+    assert hit.valid.all()
+    return torch.cat((hit.position, hit.direction, hit.path_length[:, None]), -1)
 
 
-def _powers(name):
-    from dolens.optics.surfaces.xy_polynomial import monomial_powers
-
-    return monomial_powers(name)
-
-
-def has_flat_back(lens):
-    last = list(lens.surfaces.values())[-1]
-    return all(float(p.detach()) == 0.0 for p in last.parameters())
-
-
-QUANTITIES = {
-    "sensor_x": lambda hit: hit.position[..., 0],
-    "sensor_y": lambda hit: hit.position[..., 1],
-    "path_length": lambda hit: hit.path_length,
-    "direction_x": lambda hit: hit.direction[..., 0],
-}
-
-
-@pytest.mark.parametrize("quantity", QUANTITIES)
-def test_gradient_of_every_parameter(bent_lens, bundle, quantity):
-    rays = bundle(bent_lens)
-    assert bent_lens.trace(rays).valid.all()
-    weights = torch.linspace(0.7, 1.9, rays.direction.shape[0], dtype=torch.float64)
-
-    def function():
-        return (weights * QUANTITIES[quantity](bent_lens.trace(rays))).sum()
-
-    parameters = dict(bent_lens.named_parameters())
-    gradients = torch.autograd.grad(function(), parameters.values(), allow_unused=True)
-    value = abs(float(function().detach()))
-    for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True):
-        step = step_for(name, bent_lens)
-        expected = finite_difference(function, parameter, step)
-        found = 0.0 if gradient is None else float(gradient)
-        # What rounding of the function leaves in the difference quotient.
-        rounding = 50 * 2.2e-16 * max(value, 1.0) / step
-        assert found == pytest.approx(expected, rel=1e-6, abs=rounding), name
-        # Gaps before nothing but planes move light and do not turn it.
-        gaps = {"sensor_distance"}
-        if has_flat_back(bent_lens):
-            gaps.add(f"thicknesses.{len(bent_lens.surfaces) - 1}")
-        must_vanish = quantity == "direction_x" and name in gaps
-        assert (found == 0.0) == must_vanish, name
-
-
-@pytest.mark.parametrize("quantity", QUANTITIES)
-def test_gradient_of_ray_origins_and_directions(bent_lens, bundle, quantity):
-    rays = bundle(bent_lens)
-    position = rays.position.clone().requires_grad_()
-    direction = rays.direction.clone().requires_grad_()
-    weights = torch.linspace(0.7, 1.9, len(position), dtype=torch.float64)
-
-    def function(position=position, direction=direction):
-        hit = bent_lens.trace(Rays(position, direction, rays.wavelength))
-        return (weights * QUANTITIES[quantity](hit)).sum()
-
-    found = torch.autograd.grad(function(), (position, direction))
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forward", "backward"])
+@pytest.mark.parametrize("name", LENSES)
+def test_derivatives_are_those_of_differences(root, name, sense):
+    """In every parameter and in the rays, by both implementations; forward the Jacobian's too."""
+    lens = LENSES[name](root)
+    rays, send = passing(lens), lens.trace
+    if sense < 0.0:
+        there, send = lens.trace(rays), lens.sensor_to_scene
+        rays = Rays(there.position.detach(), -there.direction.detach(), 550.0)
+    position, direction = (v.clone().requires_grad_() for v in (rays.position, rays.direction))
+    numbers = {**dict(lens.named_parameters()), "position": position, "direction": direction}
     generator = torch.Generator().manual_seed(1)
-    # A direction is a unit vector, so only tangent motions have a meaning.
-    tangent = torch.randn(direction.shape, generator=generator, dtype=torch.float64)
-    d = direction.detach()
-    tangent = tangent - (tangent * d).sum(-1, keepdim=True) * d
-    shift = torch.randn(position.shape, generator=generator, dtype=torch.float64)
-    with torch.no_grad():
+    weights, *ways = (
+        torch.rand(shape, generator=generator, dtype=torch.float64) + 0.5
+        for shape in ((len(position), 7), *(n.shape for n in numbers.values()))
+    )
+    ways = dict(zip(numbers, ways, strict=True))
 
-        def turned(h):
-            along = d + h * tangent
-            return function(position, along / along.norm(dim=-1, keepdim=True))
+    def traced():
+        unit = direction / direction.norm(dim=-1, keepdim=True)
+        return outputs(send(Rays(position, unit, 550.0)))
 
-        for gradient, motion, moved, h in (
-            (found[0], shift, lambda h: function(position + h * shift, direction), 1e-2),
-            (found[1], tangent, turned, 1e-4),
-        ):
-            ends = [float(moved(k * h)) for k in (-2, -1, 1, 2)]
-            expected = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h)
-            exact = float((gradient * motion).sum())
-            assert exact == pytest.approx(expected, rel=1e-6)
+    @torch.no_grad()
+    def moved(number, by):
+        kept = number.clone()
+        number.add_(by)
+        found = traced()
+        number.copy_(kept)
+        return found
+
+    def difference(name):
+        """Fourth-order central difference, whose steps move light by 0.1 µm."""
+        number, way = numbers[name], ways[name]
+        probe = 1e-6 * float(number.detach().abs().max()) or 1e-12
+        size = float((moved(number, probe * way) - moved(number, 0.0)).abs().max()) / probe
+        step = 1e-4 / max(size, 0.01)
+        ends = [moved(number, k * step * way) for k in (-2, -1, 1, 2)]
+        return (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
+
+    lens.backend = "cpu"
+    expected = {name: difference(name) for name in numbers}
+    for lens.backend in BACKENDS:
+        gradients = torch.autograd.grad(
+            (weights * traced()).sum(), list(numbers.values()), allow_unused=True
+        )
+        for (name, wanted), gradient in zip(expected.items(), gradients, strict=True):
+            found = 0.0 if gradient is None else float((gradient * ways[name]).sum())
+            allowed = 1e-7 + 1e-6 * float((weights * wanted).abs().sum())
+            assert found == pytest.approx(float((weights * wanted).sum()), abs=allowed), name
+        if sense > 0.0:
+            jacobian = ray_jacobian(lens, rays, ["*"], OUTPUTS)
+            for name, columns in jacobian.columns.items():
+                column = jacobian.derivatives[..., columns] @ ways[name].flatten()
+                error = (column - expected[name][:, [0, 1, 6, 3, 4, 5]]).abs().max()
+                assert error < 1e-8 + 1e-6 * expected[name].abs().max(), name
 
 
-def test_backward_traces_have_gradients_too(bent_lens, bundle):
-    with torch.no_grad():
-        forward = bent_lens.trace(bundle(bent_lens))
-        rays = Rays(forward.position, -forward.direction, 550.0)
-
-    def function():
-        hit = bent_lens.sensor_to_scene(rays)
-        assert hit.valid.all()
-        return weighted(hit)
-
-    parameters = {n: p for n, p in bent_lens.named_parameters() if n != "sensor_distance"}
-    gradients = torch.autograd.grad(function(), parameters.values())
-    for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True):
-        step = step_for(name, bent_lens)
-        expected = finite_difference(function, parameter, step)
-        assert float(gradient) == pytest.approx(expected, rel=1e-6, abs=1e-13 / step), name
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", LENSES)
+def test_light_goes_back_the_way_it_came(root, name, backend):
+    """To the first surface: with the same path, and in the same line as it came."""
+    lens = LENSES[name](root)
+    lens.backend, rays = backend, passing(lens)
+    hit = lens.trace(rays)
+    back = lens.sensor_to_scene(Rays(hit.position, -hit.direction, 550.0))
+    assert back.valid.all()
+    assert (back.direction + rays.direction).abs().max() < 1e-12
+    away = back.position - rays.position
+    along = (away * rays.direction).sum(-1, keepdim=True)
+    assert (away - along * rays.direction).abs().max() < 1e-11
+    assert (hit.path_length - back.path_length - along[:, 0]).abs().max() < 1e-11
 
 
 # --- the reference's RMS spot radii and exact derivatives ---------------------------------------
@@ -166,6 +118,7 @@ def grid_spot(lens, entry, count=31):
     return ((points - centroid) ** 2).sum(-1).mean().sqrt(), hit.valid, centroid
 
 
+@both
 def test_rms_spot_radii_and_their_derivatives(reference, root):
     data = reference("rms_triplet__dfc__deriv.json")
     lens = load_lens(root / "conf" / "lens" / "cooke_triplet.yaml", torch.float64, "dfc")
@@ -193,6 +146,7 @@ def test_rms_spot_radii_and_their_derivatives(reference, root):
         assert rms == pytest.approx(float(entry["rms"]), rel=1e-11)
 
 
+@both
 def test_the_half_width_of_the_grid(reference, root):
     """R = tan(field)·sag(r₁) + r₁: the grid's half-width follows from the lens itself."""
     lens = load_lens(root / "conf" / "lens" / "cooke_triplet.yaml")
@@ -217,6 +171,7 @@ def reference_rays(reference, statuses):
     )
 
 
+@both
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
 @pytest.mark.parametrize("record", [False, True])
 def test_lost_rays_leave_no_trace_in_gradients(reference, root, dtype, record):
@@ -248,6 +203,7 @@ def test_lost_rays_leave_no_trace_in_gradients(reference, root, dtype, record):
     assert (origins[~ok] == 0).all()
 
 
+@both
 @pytest.mark.parametrize("kind", ["grazing", "backwards", "sideways", "huge", "nan_free_centre"])
 def test_absurd_rays_stay_finite(root, bent_lens, kind):
     position, direction = {
@@ -268,6 +224,7 @@ def test_absurd_rays_stay_finite(root, bent_lens, kind):
         assert torch.isfinite(gradient).all()
 
 
+@both
 def test_no_rays_at_all(bent_lens):
     position = torch.zeros((0, 3), dtype=torch.float64)
     direction = torch.zeros((0, 3), dtype=torch.float64)
@@ -280,6 +237,7 @@ def test_no_rays_at_all(bent_lens):
         assert all((p.grad is None or torch.isfinite(p.grad)) for p in bent_lens.parameters())
 
 
+@both
 def test_a_source_at_a_hundred_kilometres_is_at_infinity(bent_lens):
     """A parallel beam, launched at the lens or 1e8 mm before it, lands at the same point."""
     height = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
@@ -300,11 +258,12 @@ def test_a_source_at_a_hundred_kilometres_is_at_infinity(bent_lens):
     assert float(results[0][1]) == pytest.approx(float(results[1][1]), rel=1e-7)
 
 
-def test_leading_shapes_and_wavelengths_broadcast(bent_lens, bundle):
-    rays = bundle(bent_lens)
+@both
+def test_leading_shapes_and_wavelengths_broadcast(bent_lens):
+    rays = passing(bent_lens)
     wavelengths = torch.tensor([[656.2725], [486.1327]], dtype=torch.float64)
     hit = bent_lens.trace(Rays(rays.position, rays.direction, wavelengths), record=True)
-    assert hit.position.shape == (2, 7, 3)
+    assert hit.position.shape == (2, len(rays.position), 3)
     for row, wavelength in zip(hit.position, wavelengths, strict=True):
         alone = bent_lens.trace(Rays(rays.position, rays.direction, float(wavelength)))
         assert (alone.position - row).abs().max() < 1e-13

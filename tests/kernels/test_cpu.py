@@ -1,4 +1,4 @@
-"""The CPU kernels of surfaces given by their sag answer to the reference."""
+"""The CPU kernels answer to the reference, for every kind of lens."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays
-from dolens.optics.jacobian import ray_jacobian
+from dolens.optics.jacobian import OUTPUTS, normal_equations, ray_jacobian
 from dolens.optics.surfaces.clear_aperture import Circle
 from tests.kernels.trace_cases import (
     LENSES,
@@ -18,8 +18,8 @@ from tests.kernels.trace_cases import (
     traced,
 )
 
-NAMES = ("even_aspheres", "odd_aspheres", "anamorphic", "cylinders", "zernike", "forbes", "grid")
-CASES = pytest.mark.parametrize("name", NAMES)
+BY_SAG = ("even_aspheres", "odd_aspheres", "anamorphic", "cylinders", "zernike", "forbes", "grid")
+CASES = pytest.mark.parametrize("name", LENSES)
 
 
 @CASES
@@ -32,10 +32,11 @@ def test_rays_and_gradients_are_those_of_the_reference(name, sense, root):
     require_equal(traced(lens, rays, "cpu", sense), expected)
 
 
-@CASES
+# Gradients of Zernike phases err by one rounding, and the reference's by a half.
+@pytest.mark.parametrize("name", [name for name in LENSES if name != "zernike_phases"])
 def test_single_precision_is_no_worse_than_the_reference(name, root):
     lens = LENSES[name](root)
-    rays = bundle(lens, fill=0.9)
+    rays = bundle(lens, 1000, fill=0.9)
     held = Rays(rays.position.float().double(), rays.direction.float().double(), 550.0)
     lens = lens.float().double()
     found = traced(lens, held, "cpu", dtype=torch.float32)
@@ -44,19 +45,29 @@ def test_single_precision_is_no_worse_than_the_reference(name, root):
 
 
 @CASES
-def test_its_jacobian_is_that_of_the_reference(name, root):
+def test_jacobians_and_normal_equations_are_those_of_the_reference(name, root):
     lens = LENSES[name](root)
-    rays, found = bundle(lens, 40), []
+    rays, found = bundle(lens, 60, wavelengths=[[486.1327], [656.2725]]), []
     for backend in ("cpu", "reference"):
         lens.backend = backend
-        found.append(ray_jacobian(lens, rays, ["surfaces.*", "thicknesses.1"]))
-    assert torch.equal(found[0].valid, found[1].valid)
-    size = found[1].derivatives.abs().amax((0, 1) if found[1].derivatives.dim() == 3 else 0)
-    error = (found[0].derivatives - found[1].derivatives).abs()
-    assert (error <= 1e-10 * (1.0 + size)).all()
+        jacobian = ray_jacobian(lens, rays, ["*"], OUTPUTS)
+        sums = normal_equations(lens, rays, ["*"], outputs=("x", "y", "path_length"))
+        found.append((jacobian, sums))
+    (fast, sums), (slow, expected) = found
+    assert torch.equal(fast.valid, slow.valid) and fast.columns == slow.columns
+    assert 0 < int(slow.valid.sum()) < slow.valid.numel()
+    assert (fast.values - slow.values).abs().max() < 1e-11
+    scale = slow.derivatives.abs().amax((0, 1))
+    # A column that vanishes by symmetry is rounding of terms that do not.
+    error = (fast.derivatives - slow.derivatives).abs().amax((0, 1))
+    assert (error <= 1e-11 * scale.clamp(min=1e-2)).all()
+    assert int(sums.count) == int(expected.count)
+    for what in ("jtj", "jtr"):
+        one, other = getattr(sums, what), getattr(expected, what)
+        assert (one - other).abs().max() <= 1e-9 * other.abs().max()
 
 
-@CASES
+@pytest.mark.parametrize("name", BY_SAG)
 def test_a_semi_diameter_without_end_costs_no_digits(name, root):
     """Newton's iteration ends by lengths of the beam, not of an aperture that nothing reaches."""
     lens = LENSES[name](root)
@@ -71,7 +82,7 @@ def test_a_semi_diameter_without_end_costs_no_digits(name, root):
         assert (found.position - expected.position)[both].abs().max() < 1e-11
 
 
-@pytest.mark.parametrize("name", LENSES)
+@CASES
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_ray_through_the_vertices_has_finite_gradients(name, dtype, root):
     """One along the axis, and two askew through the first vertex."""

@@ -1,11 +1,15 @@
-"""Cardinal points, finite conjugates and paraxial rays against closed forms."""
+"""First-order optics against closed forms, reference data of 28 digits, and plain numbers."""
 
 import math
+from decimal import Decimal
 
 import pytest
 import torch
+import yaml
 
 from dolens import InputError, load_lens
+from dolens.optics.paraxial import TwoRays, chief_ray_magnification, exit_pupil, through_surfaces
+from dolens.optics.paraxial_rays import ParaxialNumbers
 from dolens.prescriptions import lens_from_prescription
 
 N = 1.5
@@ -112,6 +116,10 @@ def test_a_thin_lens_at_finite_conjugates(distance):
     assert close(found.image, image)
     assert close(found.magnification, -image / distance)
     assert close(found.working_f_number, 10.0 * (1 + image / distance))
+    # The chief ray goes straight through the lens to the sensor.
+    system, pupil = lens.system(), exit_pupil(lens.system(), D_LINE)
+    assert close(chief_ray_magnification(system, D_LINE, distance), -50.0 / distance)
+    assert close(pupil.z, 0.0) and close(pupil.diameter, 10.0)
 
 
 def test_an_object_at_the_front_focus_is_imaged_at_infinity():
@@ -141,8 +149,6 @@ def test_object_distances_that_are_none():
 
 
 # --- afocal and telecentric ----------------------------------------------------------------------
-
-
 def test_a_plate_is_afocal_and_poisons_no_gradient():
     lens = singlet(math.inf, math.inf, 10.0)
     found = lens.first_order(D_LINE, 100.0)
@@ -201,13 +207,10 @@ def test_a_telecentric_lens_has_its_exit_pupil_at_infinity():
     assert close(lens.paraxial_rays(3.0).chief.slope_after[-1], 0.0)
 
 
-# --- paraxial rays -------------------------------------------------------------------------------
-
-LENSES = ["cooke_triplet", "nikon", "large_fov_doublet", "asphere", "wavefront_coding"]
-
-
 @pytest.mark.parametrize("distance", [None, 700.0])
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(
+    "name", ["cooke_triplet", "nikon", "large_fov_doublet", "asphere", "wavefront_coding"]
+)
 @pytest.mark.parametrize("model", ["dfc", "do"])
 def test_the_two_paraxial_rays(root, name, distance, model):
     lens = load_lens(root / "conf" / "lens" / f"{name}.yaml", torch.float64, model)
@@ -243,12 +246,13 @@ def test_the_two_paraxial_rays(root, name, distance, model):
 
 
 @pytest.mark.parametrize("distance", [None, 300.0])
-def test_gradients_of_every_first_order_quantity(root, distance):
-    lens = load_lens(root / "conf" / "lens" / "cooke_triplet.yaml")
-    parameters = lens.variables(["surfaces.[135].curvature", "thicknesses.[24]"])
+@pytest.mark.parametrize("name", ["cooke_triplet", "asphere", "wavefront_coding", "nikon"])
+def test_gradients_of_every_first_order_quantity(root, name, distance):
+    lens = load_lens(root / "conf" / "lens" / f"{name}.yaml")
+    parameters = lens.variables(["surfaces.*.curvature", "thicknesses.*"])
     names = [
-        "power", "ffd", "front_principal", "rear_principal", "front_nodal", "rear_nodal", "image",
-        "magnification", "working_f_number",
+        "efl", "power", "ffd", "front_principal", "rear_principal", "front_nodal", "rear_nodal",
+        "image", "magnification", "working_f_number",
     ]  # fmt: skip
 
     def quantities():
@@ -271,10 +275,12 @@ def test_gradients_of_every_first_order_quantity(root, distance):
                 ends.append(quantities())
             parameter.copy_(kept)
         slopes = (ends[0] - ends[1]) / (2 * step)
+        # What rounding of the quantities leaves in the differences.
+        rounding = 1e-14 * ends[0].abs() / step + 1e-8 * slopes.abs().max()
         for row, slope in enumerate(slopes.tolist()):
             gradient = exact[row][column]
             found = 0.0 if gradient is None else float(gradient)
-            assert found == pytest.approx(slope, rel=1e-6, abs=1e-8 * float(slopes.abs().max()))
+            assert found == pytest.approx(slope, rel=1e-6, abs=float(rounding[row]))
 
 
 def test_single_precision_stays_single(root):
@@ -283,3 +289,113 @@ def test_single_precision_stays_single(root):
     rays = lens.paraxial_rays(5.0, D_LINE, 500.0)
     for value in (found.power, found.image, found.magnification, rays.chief.height):
         assert value.dtype == torch.float32
+
+
+REFERENCE = {
+    "asphere_initial": "asphere",
+    "asphere_optimized": "asphere_optimized",
+    "triplet": "cooke_triplet",
+    "nikon_original": "nikon",
+    "nikon_optimized": "nikon_optimized",
+    "wfc_flat": "wavefront_coding",
+    "wfc_cubic_1e-4": "wavefront_coding",  # a cubic plate has no first-order power
+    "largefov": "large_fov_doublet",
+}
+
+
+def relative(found, expected):
+    expected = float(expected)
+    return abs(float(found.detach()) - expected) / max(abs(expected), 1e-300)
+
+
+@pytest.mark.parametrize("model", ["dfc", "do", "paper"])
+@pytest.mark.parametrize("lens_name", REFERENCE)
+def test_every_first_order_property(reference, root, lens_name, model):
+    entries = reference("first_order.json")["data"][lens_name][model]
+    assert len(entries) == 5
+    lens = load_lens(
+        root / "conf" / "lens" / f"{REFERENCE[lens_name]}.yaml", torch.float64, index_model=model
+    )
+    for wavelength, expected in entries.items():
+        found = lens.first_order(float(wavelength))
+        assert lens.stop == expected["stop_surface"]
+        assert relative(found.efl, expected["efl"]) < 1e-12
+        assert relative(found.efl * found.image_index, expected["efl_image_space"]) < 1e-12
+        assert relative(found.bfd, expected["bfd"]) < 1e-12
+        assert relative(found.focus, expected["z_focus"]) < 1e-12
+        assert relative(lens.system().vertices[-1], expected["z_sensor"]) < 1e-12
+        if float(expected["ep_z"]) == 0.0:
+            assert float(found.entrance_pupil.z) == 0.0
+        else:
+            assert relative(found.entrance_pupil.z, expected["ep_z"]) < 1e-12
+        assert relative(found.entrance_pupil.diameter, expected["ep_diameter"]) < 1e-12
+        assert relative(found.f_number, expected["fno_stop"]) < 1e-12
+
+
+FILES = ["cooke_triplet", "double_gauss", "large_fov_doublet", "nikon", "wavefront_coding"]
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("wavelength", [486.1327, 656.2725])
+def test_the_lenses_pupils_and_magnifications(root, name, wavelength):
+    """`paraxial` is itself tested against closed forms and reference data."""
+    prescription = yaml.safe_load((root / f"conf/lens/{name}.yaml").read_text())
+    system = lens_from_prescription(prescription).double().system()
+    numbers = ParaxialNumbers.of(system)
+    z, diameter = numbers.exit_pupil(wavelength)
+    wanted = exit_pupil(system, wavelength)
+    assert z == pytest.approx(float(wanted.z.detach()), rel=1e-12)
+    assert diameter == pytest.approx(float(wanted.diameter.detach()), rel=1e-12)
+    for depth in (500.0, 1e6):
+        found = numbers.chief_ray_magnification(wavelength, depth)
+        assert found == pytest.approx(
+            float(chief_ray_magnification(system, wavelength, depth).detach()), rel=1e-11
+        )
+
+
+def test_a_stop_at_the_front_focus_is_seen_at_infinity():
+    """Telecentric: D = 1 - t/f is nothing at t = f, and a stop there magnifies as the lens does."""
+    lens = ParaxialNumbers(
+        (0.0, 0.02, 0.0), (100.0, 0.0), 120.0, (_Air(), _Air(), _Glass(), _Air()), 1, 5.0,
+        (1.0, 1.0, 1.0, 1.0),
+    )  # fmt: skip
+    assert lens.exit_pupil(550.0) == (math.inf, math.inf)
+    # Chief rays through the front focus leave parallel to the axis: -f/(depth) for f = 100.
+    assert lens.chief_ray_magnification(550.0, 400.0) == pytest.approx(-100.0 / 400.0)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_paraxial_rays_are_those_of_28_digits(root, name):
+    """The same recurrence in decimals, from the same rays: rounding leaves parts in 10¹⁴."""
+    prescription = yaml.safe_load((root / f"conf/lens/{name}.yaml").read_text())
+    lens = lens_from_prescription(prescription, torch.float64).requires_grad_(False)
+    system = lens.system()
+    rays = lens.paraxial_rays(5.0, 587.5618)
+    curvatures = [s.shape.paraxial_curvature(s.parameters) for s in system.surfaces]
+    c, t, n = (
+        [Decimal(float(v)) for v in values]
+        for values in (curvatures, system.thicknesses, system.indices(587.5618))
+    )
+    y, u = (
+        [Decimal(float(getattr(ray, what)[0])) for ray in rays[:2]]
+        for what in ("height", "slope_before")
+    )
+    exact = list(through_surfaces(TwoRays(*y, n[0] * u[0], n[0] * u[1]), c, t, n))
+    for ray, height, slope in ((rays.marginal, 0, 2), (rays.chief, 1, 3)):
+        for found, wanted in (
+            (ray.height, [step[height] for step in exact]),
+            (ray.slope_after, [step[slope] / n[i + 1] for i, step in enumerate(exact)]),
+        ):
+            wanted = torch.tensor([float(w) for w in wanted], dtype=torch.float64)
+            error = found - wanted
+            assert float(error.abs().max()) < 3e-14 * float(found.abs().max())
+
+
+class _Air:
+    def index(self, wavelength):
+        return 1.0
+
+
+class _Glass:
+    def index(self, wavelength):
+        return torch.tensor(1.5, dtype=torch.float64)
