@@ -10,9 +10,6 @@ import torch
 from matplotlib.colors import same_color, to_rgb
 
 from dolens import load_lens
-from dolens.analysis.spot_diagram import spot_diagram
-from dolens.diffraction.entrance_beam import ObjectPoints
-from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
 from dolens.lens_page.page import write_page
 from dolens.manufacturing.glass_elements import glass_elements
@@ -273,29 +270,6 @@ def test_a_page_of_a_folded_lens_has_a_viewer_and_its_breaks(telescope, tmp_path
     data = json.loads(re.search(r'id="viewer-data"[^>]*>(.*?)</script>', text, re.S)[1])
     kinds = [mesh["kind"] for mesh in data["meshes"]]
     assert kinds.count("mirror") == 2 and "glass" not in kinds
-
-
-def test_spots_and_wavefronts_behind_an_odd_number_of_mirrors_are_those_of_the_mirror_alone(
-    telescope,
-):
-    """A flat moves nothing: the folded telescope and its paraboloid have the same wavefront."""
-    row = {"type": "conic", "radius": -2000.0, "conic": -1.0, "semi_diameter": 100.0,
-           "material": "mirror"}  # fmt: skip
-    straight = lens_from_prescription({"surfaces": {"1": row}, "sensor": {"distance": -1000.0}})
-    fields = [[0.0, 0.0], [0.0, 0.2]]
-    found, expected = (
-        spot_diagram(lens, torch.tensor(fields).double(), torch.tensor([550.0]).double(), 400)
-        for lens in (telescope, straight)
-    )
-    assert torch.allclose(found.rms, expected.rms, rtol=1e-6, atol=1e-9)
-    points = ObjectPoints.at_infinity(fields)
-    waves = [
-        pupil_wavefront(lens.system(), points, 550.0, samples=16) for lens in (telescope, straight)
-    ]
-    for found in waves:
-        assert float(found.rms[0].detach()) < 1e-9
-        assert float(found.strehl_ratio[0].detach()) == pytest.approx(1.0)
-    assert torch.allclose(waves[0].rms, waves[1].rms, rtol=1e-3, atol=1e-9)
 
 
 def test_what_needs_a_straight_axis_says_so(telescope):

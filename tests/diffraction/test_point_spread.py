@@ -100,8 +100,10 @@ def test_mtf_of_an_obscured_pupil_is_o_neill_s():
         / (math.pi * (1.0 - share**2))
         for d in shear
     ]
-    np.testing.assert_allclose(found.tangential[0], expected, atol=3e-3)
-    np.testing.assert_allclose(found.sagittal[0], expected, atol=3e-3)
+    for curve in (found.tangential[0], found.sagittal[0]):
+        np.testing.assert_allclose(curve, expected, atol=3e-3)
+    wrong = np.abs(found.tangential[0].numpy() - expected)[1:].max()
+    assert wrong < 3.0 * float(found.sampling_error) + 1e-4
 
 
 def test_defocus_lowers_the_strehl_ratio_by_its_sinc():
