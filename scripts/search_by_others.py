@@ -1,31 +1,27 @@
-"""Global optimizers of SciPy and Optiland on the merit function of a search, with its bounds.
+"""SciPy's global optimizers on the merit function of a search, with its bounds and exact gradients.
 
     python scripts/search_by_others.py search_triplet --stop 2 --seconds 115 --out FOLDER \
-        [--methods "differential evolution,Optiland CMAES"] [--optiland PYTHON_WITH_OPTILAND]
+        [--methods "differential evolution,random restarts"]
 
 The merit is that of the last stage: Σ of squared spots of all fields and squared deviations of the
-specification, weighted as the search does at its end.  SciPy has its exact gradients: differential
-evolution has a population of 15 lenses a variable, evaluated as one batch; basin hopping, dual
-annealing and random restarts descend by L-BFGS-B, one lens at a time.  Optiland has a process, a
-lens and a tracer of its own (`lens_search/optiland_search.py`), and gets the task in plain numbers.
-Each method has so many seconds of processor time on one core, then its best is fitted once more by
-the search's own finish, so that a row says how good the basin is that was found.  A lens counts
-that keeps its operands to a thousandth.  Runs that FOLDER has are not repeated.
+specification, weighted as the search does at its end.  Differential evolution has a population of
+15 lenses a variable, evaluated as one batch; basin hopping, dual annealing and random restarts
+descend by L-BFGS-B with the merit's gradient, one lens at a time.  Each has so many seconds of
+processor time on one core, then its best is fitted once more by the search's own finish, so that a
+row says how good the basin is that was found.  A lens counts that keeps its operands to a
+thousandth.  Runs that FOLDER has are not repeated.
 """
 
 import argparse
 import json
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,11 +30,10 @@ from scipy.optimize import basinhopping, differential_evolution, dual_annealing,
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from dolens.lens_search.arrangement import AIR, Arrangement
+from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.growth import settled
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.search import SearchPlan
-from scripts.lens_search.optiland_search import METHODS as OPTILANDS
 from scripts.search_parts import task
 
 Array = NDArray[np.float64]
@@ -81,38 +76,6 @@ class Task:
         surfaces = self.merit.arrangement.surfaces
         lower[:surfaces], upper[:surfaces] = -curved, curved
         return list(zip(lower.tolist(), upper.tolist(), strict=True))
-
-    def as_plain(self, curved: float) -> dict[str, Any]:
-        """Return the task as `lens_search.plain_task.PlainTask` reads it, in mm.
-
-        Args:
-            curved: greatest curvature times the focal length.
-        """
-        merit, arrangement = self.merit, self.merit.arrangement
-        specification, rays = merit.specification, merit.rays
-        table = merit.family.table(merit.family.start[None]).indices[0].tolist()
-        ends = merit.scales * torch.tensor(self.bounds(curved), dtype=torch.float64).T
-        chiefs = rays.chiefs
-        return {
-            "focal_length": specification.focal_length,
-            "f_number": specification.f_number,
-            "wavelengths": list(specification.wavelengths),
-            "reference": specification.reference,
-            "field_tangents": rays.slopes.tolist(),
-            "chief_tangents": rays.tangent[len(rays.tangent) - chiefs :].tolist(),
-            "sequence": list(arrangement.sequence),
-            "in_glass": [medium != AIR for medium in arrangement.media_behind],
-            # Rows: in front of the pupil's plane, behind it, and behind each of the sequence.
-            "indices": table[2 : 2 + arrangement.gaps],
-            "terms": list(arrangement.terms or (0,) * arrangement.surfaces),
-            "scales": merit.scales.tolist(),
-            "lower": ends[0].tolist(),
-            "upper": ends[1].tolist(),
-            "weight_of_limits": merit.operand_weight,
-            "limits": asdict(specification.limits),
-            "pupil": rays.pupil.tolist(),
-            **{n: getattr(rays, n).tolist() for n in ("tangent", "weight", "group", "wavelength")},
-        }
 
     def finished(self, u: Array | None) -> float | None:
         """Return the mean RMS spot, µm, of a lens after the search's own finish; None where it
@@ -286,27 +249,20 @@ def main() -> None:
     parser.add_argument("--stop", type=int, required=True, help="behind so many groups")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--methods", help="names with commas; default: all that can run")
+    parser.add_argument("--methods", default=",".join(METHODS), help="names with commas")
     parser.add_argument("--curved", type=float, default=5.0, help="curvatures over 1/f at most")
-    parser.add_argument("--optiland", help="a Python that has Optiland; its methods run too")
     parser.add_argument("--out", type=Path, required=True, help="folder of what is found")
     given = parser.parse_args()
     torch.set_num_threads(1)
     of = Task.of(given.experiment, given.stop)
-    every = [*METHODS, *(f"Optiland {name}" for name in OPTILANDS if given.optiland)]
-    methods = given.methods.split(",") if given.methods else every
-    for seed, name in product(range(given.seeds), methods):
+    for seed, name in product(range(given.seeds), given.methods.split(",")):
         run = Run(given.experiment, name, seed, given.seconds, 0, None, None)
-        if run.path(given.out).exists():
-            continue
-        if name in METHODS:
-            _by_scipy(of, of.bounds(given.curved), run).keep(given.out)
-        else:
-            _by_optiland(of, of.as_plain(given.curved), run, given.optiland).keep(given.out)
+        if not run.path(given.out).exists():
+            searched(of, of.bounds(given.curved), run).keep(given.out)
     print(table(kept(given.out, given.experiment)), flush=True)
 
 
-def _by_scipy(of: Task, bounds: list[tuple[float, float]], run: Run) -> Run:
+def searched(of: Task, bounds: list[tuple[float, float]], run: Run) -> Run:
     """Return a run with what it found."""
     middle = np.mean(bounds, axis=1)[None]
     Objective(of.merit, np.inf).both(middle)  # compiles kernels: no part of the search
@@ -316,22 +272,6 @@ def _by_scipy(of: Task, bounds: list[tuple[float, float]], run: Run) -> Run:
     values = None if objective.where is None else objective.where.tolist()
     spot = of.finished(objective.where)
     return replace(run, lenses=objective.count, values=values, spot=spot)
-
-
-def _by_optiland(of: Task, plain: dict[str, Any], run: Run, python: str) -> Run:
-    """Return a run with what Optiland found."""
-    with tempfile.TemporaryDirectory() as folder:
-        task_file, found = Path(folder) / "task.json", Path(folder) / "found.json"
-        task_file.write_text(json.dumps(plain))
-        script = str(Path(__file__).parent / "lens_search" / "optiland_search.py")
-        method = run.method.removeprefix("Optiland ")
-        command = [python, script, "--task", str(task_file), "--method", method]
-        command += ["--seconds", str(run.seconds), "--seed", str(run.seed), "--out", str(found)]
-        subprocess.run(command, check=True)
-        data = json.loads(found.read_text())
-    values = data["values"]
-    spot = of.finished(None if values is None else np.array(values))
-    return replace(run, lenses=data["lenses"], values=values, spot=spot)
 
 
 if __name__ == "__main__":
