@@ -9,7 +9,6 @@ import random
 import sys
 import tempfile
 import time
-import unicodedata
 import warnings
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -29,13 +28,12 @@ from dolens.prescriptions.files import (
     published_lens_names,
 )
 from dolens.prescriptions.plain_values import plain_values, yaml_of
-from scripts.guarded_cases import guarded, place_of
+from scripts.guarded_cases import guarded, place_of, unclear
 from tests.prescriptions import test_json_lenses, test_oslo
 from tests.prescriptions.codev import samples as codev_samples
 from tests.prescriptions.mutations import mutated
 from tests.prescriptions.zemax import samples as zemax_samples
 
-LONGEST = 500
 # How often files of each kind are drawn; the prescriptions are of dolens, the rest of others too.
 SHARES = {".yaml": 6, ".json": 4, ".zmx": 5, ".seq": 3, ".len": 2, ".txt": 2, ".agf": 2}
 _LARGEST = 60_000
@@ -119,10 +117,8 @@ def _message(message: str, path: Path) -> tuple[str, str]:
     """Return whether a message is one clear line that names the file."""
     message = message.replace(str(path), path.name)
     shown = ascii(message[:200])
-    if any(unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp") for letter in message):
-        return "message with control characters", shown
-    if len(message) > LONGEST:
-        return "message is endless", shown
+    if said := unclear(message):
+        return said, shown
     if not message.startswith(path.name):
         return "message does not begin with the file", shown
     return "one line", shown

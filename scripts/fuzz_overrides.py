@@ -14,7 +14,6 @@ import random
 import sys
 import tempfile
 import time
-import unicodedata
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -39,11 +38,10 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.running.faults import machine_fault, reason_of
 from dolens.experiments.running.run_files import flat
 from dolens.experiments.running.training import run
-from scripts.guarded_cases import guarded, place_of
+from scripts.guarded_cases import guarded, place_of, unclear
 from tests.experiments.conftest import composing
 
 ROOT = Path(__file__).resolve().parents[1]
-LONGEST = 500
 _NUMBERS = ("abc", "-1", "0", "nan", "inf", "-inf", "1e300", "''", "null", "[]", "[1,2]", "true",
             "{a:1}", "-1e-3", "1.5", "1000000000000")  # fmt: skip
 _TEXTS = ("''", "foo", "3", "-1.5", "null", "[]", "true", "{a:1}")
@@ -169,10 +167,8 @@ def _judged(error: BaseException, cfg: DictConfig, overrides: tuple[str, ...]) -
     if not isinstance(error, InputError | HydraException | OmegaConfBaseException):
         return f"{type(error).__name__} at {place_of(error)}\0{one_line(error)[:300]}"
     message = reason_of(error, cfg)
-    if any(unicodedata.category(letter) in ("Cc", "Cf", "Cs") for letter in message):
-        return f"message with control characters\0{message[:200]!a}"
-    if len(message) > LONGEST:
-        return f"message is endless\0{message[:300]}"
+    if said := unclear(message):
+        return f"{said}\0{message[:300]!a}"
     key = overrides[-1].partition("=")[0].lstrip("+~")
     last = key.rpartition(".")[2]
     if last not in message and key.split(".")[0] not in message:

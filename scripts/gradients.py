@@ -10,15 +10,168 @@ error of their difference over the seeds.
 """
 
 import argparse
+import math
 import statistics
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import torch
-from benchmarks.gradient_cases import CASES, RENDERERS, image_loss, names_of
-from benchmarks.training_losses import training_losses
+from hydra.utils import instantiate
+from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens
 from dolens.optics.lens import Lens
+from dolens.prescriptions import lens_from_prescription, load_prescription
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.auto.probes import probe_texture
 from dolens.rendering.gradient_check import GradientRow, Loss, gradient_rows
+from dolens.rendering.protocol import Renderer
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.sensor.pixels import Sensor
+from scripts.composed import CONF, composed
+
+LINES = (656.2725, 587.5618, 486.1327)
+RENDERERS = ("rays", "rays_reference", "psf", "wave", "auto")
+_SMALL = (
+    "lens_dtype=float64",
+    "renderer=rays",
+    "renderer.pupil_samples=16",
+    "loss.perceptual=none",
+    "discriminator=none",
+)
+_EXPERIMENTS = {
+    "wavefront_coding": (*_SMALL, "renderer.sensor.height=48", "renderer.sensor.width=48"),
+    "large_fov_doublet": (
+        *_SMALL,
+        "renderer.sensor.height=48",
+        "renderer.sensor.width=48",
+        "renderer.sensor.pixel_pitch=0.03",
+        "network=field_pyramid",
+        "network.weights=none",
+    ),
+}
+_BATCH = 2
+
+
+@dataclass(frozen=True)
+class Case:
+    """A lens in front of a plane.
+
+    Attributes:
+        file: of the lens, in conf/lens.
+        depth: mm.
+        diagonal: of the sensor, mm; pixels divide it.
+        pitch: of the pixels instead, mm.
+        values: parameters to change first.
+        elements: of the prescription.
+    """
+
+    file: str
+    depth: float
+    diagonal: float | None = None
+    pitch: float | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+    elements: Mapping[str, Any] = field(default_factory=dict)
+
+    def lens(self) -> Lens:
+        """The lens, in double precision."""
+        prescription = load_prescription(CONF / "lens" / f"{self.file}.yaml")
+        if self.elements:
+            prescription = prescription | {"elements": dict(self.elements)}
+        lens = lens_from_prescription(prescription, torch.float64, where=self.file)
+        with torch.no_grad():
+            for name, value in self.values.items():
+                dict(lens.named_parameters())[name].fill_(value)
+        return lens
+
+    def sensor(self, pixels: int) -> Sensor:
+        """A square of pixels."""
+        pitch = self.pitch or self.diagonal / math.sqrt(2.0) / pixels
+        return Sensor(pixels, pixels, pitch)
+
+
+_POSE = {"middle": {"surfaces": [3, 4], "tilt_x": 0.8, "tilt_y": -0.4, "decenter_y": 0.06}}
+CASES = {
+    "wavefront_coding": Case(
+        "wavefront_coding",
+        8000.0,
+        pitch=0.0069,
+        values={"surfaces.5.x3": 1.5e-5, "surfaces.5.x2y": 3e-6, "surfaces.5.y3": 1.2e-5},
+    ),
+    "cooke_near": Case("cooke_triplet", 1000.0, diagonal=36.346),
+    "cooke_far": Case("cooke_triplet", 1e6, diagonal=36.346),
+    "doublet": Case("large_fov_doublet", 1e6, diagonal=48.437),
+    "nikon": Case("nikon", 1e4, diagonal=1.912),
+    "double_gauss": Case("double_gauss", 1e5, diagonal=80.8),
+    "posed": Case("cooke_triplet", 1000.0, diagonal=30.0, elements=_POSE),
+}
+
+
+def names_of(lens: Lens) -> list[str]:
+    """Every curvature, gap, coefficient and pose, the sensor, and the stop's semi-diameter."""
+    scalars = [n for n, p in lens.named_parameters() if p.dim() == 0]
+    return [*scalars, f"surfaces.{lens.stop}.semi_diameter"]
+
+
+def renderer_of(kind: str, sensor: Sensor, samples: int) -> Renderer:
+    """A renderer by name."""
+    if kind.startswith("rays"):
+        return RayRenderer(sensor, samples)
+    if kind == "auto":
+        return AutoRenderer(sensor, gradients=True)
+    wave = "wave" if kind == "wave" else "none"
+    size = min(65, 2 * (sensor.height // 2) + 9)
+    return PsfRenderer(sensor, (5, 5), samples, size, diffraction=wave)
+
+
+def image_loss(case: Case, lens: Lens, kind: str, pixels: int, samples: int) -> Loss:
+    """Mean squared error between an image and what a pinhole sees."""
+    sensor = case.sensor(pixels)
+    scene, texture = PlanarScene((case.depth,), LINES), probe_texture(sensor, 3, 0)
+    truth = pinhole_image(texture, sensor)[:, None]
+    renderer = renderer_of(kind, sensor, samples)
+    lens.backend = "reference" if kind == "rays_reference" else "auto"
+
+    def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
+        return (renderer.render(lens, scene, texture, seed, values) - truth).square().mean()
+
+    return loss
+
+
+def training_losses() -> Iterator[tuple[str, Lens, Loss, list[str]]]:
+    """Title, lens, loss, and the names of the experiment's own variables."""
+    for name, overrides in _EXPERIMENTS.items():
+        with composed([f"experiment={name}", *overrides]) as cfg:
+            lens = build_lens(RunSettings.of(cfg))
+            module = instantiate(cfg.module)(lens=lens).double()
+        module.eval()  # no statistics that move from call to call
+        yield f"{name}, its training loss", lens, _loss(module), list(module.variables.names)
+
+
+def _loss(module: torch.nn.Module) -> Loss:
+    sensor = module.views.sensor
+    generator = torch.Generator().manual_seed(1)
+    shape = (_BATCH, 3, sensor.height // 4 + 24, sensor.width // 4 + 24)
+    coarse = torch.rand(shape, generator=generator, dtype=torch.float64)
+    textures = torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bicubic")
+
+    def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
+        every = {**{n: p.detach() for n, p in module.variables().items()}, **values}
+        taken = module.views.take(module.lens, every, textures, "train", seed)
+        functions = module.functions(every, taken, "train")
+        restored = module.restore(taken, functions)
+        terms = module.loss_over_views(restored, taken.truth.to(restored.dtype))
+        return terms["total"]
+
+    return loss
 
 
 def main() -> None:

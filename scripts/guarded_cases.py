@@ -5,9 +5,12 @@ import os
 import resource
 import signal
 import traceback
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+LONGEST = 500
 
 
 class TooSlow(BaseException):
@@ -88,3 +91,10 @@ def place_of(error: BaseException) -> str:
         frames = traceback.extract_tb(error.__traceback__)[-1:]
     last = frames[-1]
     return f"{Path(last.filename).name}:{last.lineno} {last.name}"
+
+
+def unclear(message: str) -> str:
+    """Return why a message is no clear line; empty where it is one."""
+    if any(unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp") for letter in message):
+        return "message with control characters"
+    return "message is endless" if len(message) > LONGEST else ""

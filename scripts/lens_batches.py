@@ -12,11 +12,11 @@ difference of the sums from those of one lens at a time, and the time of one ite
 import argparse
 import copy
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from benchmarks.timing import Contender, by_turns
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -33,18 +33,6 @@ START = [
     *(1.082, 0.344, -1.127, -0.978, 1.847, -0.787, -2.688, 0.312),
     *(0.0419, 0.0667, 0.6548, 0.0005, 0.0005, 0.752, 0.0381, 0.02, 0.3),
 ]
-
-
-def best_of(calls: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:
-    """Return the least time of each call, s, measured in turn."""
-    found = dict.fromkeys(calls, float("inf"))
-    end = time.perf_counter() + seconds * len(calls)
-    while time.perf_counter() < end:
-        for name, call in calls.items():
-            started = time.perf_counter()
-            call()
-            found[name] = min(found[name], time.perf_counter() - started)
-    return found
 
 
 def problem(count: int) -> tuple[SearchMerit, Tensor]:
@@ -79,17 +67,6 @@ def measured(count: int, seconds: float, device: torch.device) -> list[str]:
     alone = Rays(rays.position[0], rays.direction[0], merit.specification.wavelengths[0])
     leaf = values.clone().requires_grad_()
 
-    def finished(call: Callable[[], object]) -> Callable[[], object]:
-        """Return the call with its end waited for."""
-
-        def timed() -> object:
-            found = call()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            return found
-
-        return timed
-
     def gradient() -> None:
         torch.autograd.grad(family.trace(leaf, rays).position.square().sum(), leaf)
 
@@ -105,7 +82,9 @@ def measured(count: int, seconds: float, device: torch.device) -> list[str]:
         "equations": lambda: family.normal_equations(values, rays, target),
         "iteration": iteration,
     }
-    found = best_of({name: finished(call) for name, call in calls.items()}, seconds)
+    contenders = [Contender(name, call) for name, call in calls.items()]
+    timings = by_turns(contenders, seconds * len(calls), device, most=1_000_000)
+    found = {name: float(timing.seconds.min()) for name, timing in timings.items()}
     together = family.normal_equations(
         values[:1], FamilyRays(rays.position[:1], rays.direction[:1], rays.wavelength), target[:1]
     )

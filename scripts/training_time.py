@@ -1,7 +1,8 @@
-"""Measure the training time of a camera to a PSNR, by the model that renders its images.
+"""Compare the training time of cameras to a PSNR, by the model that renders their images.
 
-    python scripts/training_time.py train --folder runs --models auto auto_geometric rays wave
-    python scripts/training_time.py show runs/* --figure training_time.png
+    dolens train -m experiment=wavefront_coding renderer=auto_geometric,rays,auto \\
+        data.steps_per_epoch=40 trainer.max_epochs=12 miscalibrations=none
+    python scripts/training_time.py outputs/wavefront_coding/sweeps/DATE_TIME/[0-9]*
 
 A row gives the seconds of planning and of a step, the seconds and steps to a validation PSNR at the
 worst depth (by rays for all of them), and what the test by waves says in the end.  Seconds are the
@@ -17,18 +18,12 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from dolens.errors import InputError
 from dolens.experiments.comparison.runs import read_run
 from dolens.plotting import save_figure
 from dolens.plotting.style import SMALL, ruled_axes
-from scripts.finished_runs import train_unless_finished
 
-MODELS = ("auto", "auto_geometric", "psf", "rays", "wave")
 _TAG = "val/psnr_db/worst"
-# Short epochs, for a validation every few seconds of training.
-_EPOCHS, _STEPS = 12, 40
 
 
 @dataclass(frozen=True)
@@ -128,37 +123,14 @@ def figure_of(found: Sequence[Training]) -> Figure:
     return figure
 
 
-def train(folder: Path, models: Sequence[str], overrides: Sequence[str]) -> None:
-    """Train the default camera by each model; finished ones are left."""
-    for model in models:
-        own = [
-            "experiment=wavefront_coding",
-            f"renderer={model}",
-            f"data.steps_per_epoch={_STEPS}",
-            f"trainer.max_epochs={_EPOCHS}",
-            f"callbacks.pictures.every_n_epochs={_EPOCHS}",
-            "miscalibrations=none",
-        ]
-        train_unless_finished(folder / model, [*own, *overrides])
-
-
 def main(arguments: Sequence[str]) -> int:
-    """Train, or print the table and write the figure."""
+    """Print the table, and write the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    training = commands.add_parser("train", help="train a camera by each model")
-    training.add_argument("--folder", type=Path, required=True)
-    training.add_argument("--models", nargs="+", default=MODELS, choices=MODELS)
-    training.add_argument("--overrides", nargs="*", default=[], help="of train.py")
-    show = commands.add_parser("show", help="table and figure of finished runs")
-    show.add_argument("folders", nargs="+", type=Path)
-    show.add_argument("--psnr", type=float, help="dB; default: what all of them reach")
-    show.add_argument("--figure", type=Path)
+    parser.add_argument("folders", nargs="+", type=Path, help="of finished runs")
+    parser.add_argument("--psnr", type=float, help="dB; default: what all of them reach")
+    parser.add_argument("--figure", type=Path)
     given = parser.parse_args(arguments)
     try:
-        if given.command == "train":
-            train(given.folder, given.models, given.overrides)
-            return 0
         found = [read_training(folder) for folder in given.folders]
         print("\n".join(table(found, given.psnr)))
         if given.figure:
