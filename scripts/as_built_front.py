@@ -15,7 +15,6 @@ import argparse
 import csv
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,8 +22,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.made_lenses import worst_decile
 from dolens.plotting import save_figure

@@ -8,12 +8,9 @@ them.
 """
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.prescriptions import load_prescription, published_lens_names
 
