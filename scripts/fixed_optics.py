@@ -94,7 +94,8 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
         data.setup(None)
         names = ("train", "validation", "test") if training else ("test",)
         made = {name: vars(_made(camera, data, name)) for name in names}
-        functions = camera.views.point_spread_functions(camera.lens, camera.variables())
+        lens = camera.lens.with_values(camera.variables())
+        functions = camera.views.point_spread_functions(lens)
         file.parent.mkdir(parents=True, exist_ok=True)
         torch.save({"functions": functions, "splits": made}, file)
     kept = torch.load(file, weights_only=True)
@@ -115,12 +116,12 @@ def _made(camera: Camera, data: CropDataModule, split: str) -> Split:
         "test": data.test_dataloader,
     }
     stage = {"validation": "val"}.get(split, split)
-    views, values = camera.views, camera.variables()
+    views, lens = camera.views, camera.lens.with_values(camera.variables())
     renderer = views.renderer if split == "train" else views.evaluation_renderer
     images, truths = [], []
     for number, textures in enumerate(loaders[split]()):
         seed = seed_of(views.seed, stage, number)
-        image = renderer.render(camera.lens, views.scene, textures, seed, values)
+        image = renderer.render(lens, views.scene, textures, seed)
         truth = linear_to_srgb(pinhole_image(views.scene.colours(textures), views.sensor))
         images.append(image.half())
         truths.append(truth.half())

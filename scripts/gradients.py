@@ -141,7 +141,8 @@ def image_loss(case: Case, lens: Lens, kind: str, pixels: int, samples: int) -> 
     lens.backend = "reference" if kind == "rays_reference" else "auto"
 
     def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
-        return (renderer.render(lens, scene, texture, seed, values) - truth).square().mean()
+        image = renderer.render(lens.with_values(values), scene, texture, seed)
+        return (image - truth).square().mean()
 
     return loss
 
@@ -165,7 +166,7 @@ def _loss(module: torch.nn.Module) -> Loss:
 
     def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
         every = {**{n: p.detach() for n, p in module.variables().items()}, **values}
-        taken = module.views.take(module.lens, every, textures, "train", seed)
+        taken = module.views.take(module.lens.with_values(every), textures, "train", seed)
         functions = module.functions(every, taken, "train")
         restored = module.restore(taken, functions)
         terms = module.loss_over_views(restored, taken.truth.to(restored.dtype))

@@ -1,11 +1,12 @@
 """A lens: surfaces, gaps, media, elements and a sensor, as a PyTorch module."""
 
+import copy
 import difflib
 import fnmatch
 from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
 from pkgutil import resolve_name
 from types import MethodType
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -216,6 +217,7 @@ class Lens(LensRays, InStates, nn.Module):
         self.elements = ModuleTable[Element](dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
+        self.given: Mapping[str, Tensor] = {}
         register_image_surface(self, sensor_curvature, sensor_conic, dtype)
         self.to(dtype)
         self._kept_system = KeptSystem()
@@ -273,13 +275,37 @@ class Lens(LensRays, InStates, nn.Module):
         """The lens as pure functions see it, with the stored values or others in their place.
 
         Args:
-            values: parameter name → tensor used instead of the stored one; besides them
-                `surfaces.<n>.semi_diameter` of a circular aperture, mm, and what
-                `dolens.optics.fabrication_errors` names, which no lens stores as parameters.
+            values: parameter name → tensor used instead of the stored one, and of one that
+                `with_values` gave; besides them `surfaces.<n>.semi_diameter` of a circular
+                aperture, mm, and what `dolens.optics.fabrication_errors` names, which no lens
+                stores as parameters.
+        """
+        if not values and not self.given:
+            return self._kept_system.of(self, self._system)
+        return self._system({**self.given, **(values or {})})
+
+    def with_values(self, values: Mapping[str, Tensor]) -> Self:
+        """Return this lens as it is with other values, for all that is computed from it.
+
+        It shares everything with this lens; `parameters` and `state_dict` are still the stored
+        ones.  Gradients flow to the values.
+
+        Args:
+            values: as `system` takes them; kept as `given`.
         """
         if not values:
-            return self._kept_system.of(self, self._system)
-        return self._system(dict(values))
+            return self
+        found = copy.copy(self)
+        found.given = {**self.given, **values}
+        return found
+
+    def as_stored(self) -> Self:
+        """Return this lens without the values that `with_values` gave it."""
+        if not self.given:
+            return self
+        found = copy.copy(self)
+        found.given = {}
+        return found
 
     def _system(self, values: dict[str, Tensor]) -> OpticalSystem:
         """Return the lens as pure functions see it; what is used of `values` is taken out."""

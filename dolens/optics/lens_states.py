@@ -134,6 +134,9 @@ def check_state(lens: Any, name: str) -> None:
 
 def in_state(lens: Any, name: str) -> Any:
     """Return a lens in a state; see `Lens.in_state`."""
+    if lens.given:
+        there = values_there(lens.as_stored(), name, lens.given)
+        return in_state(lens.as_stored(), name).with_values(there)
     found, data = overlaid(lens, name), lens.states[name].data
     if data.temperature is None and data.pressure is None:
         return found

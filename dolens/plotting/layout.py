@@ -1,7 +1,7 @@
 """A layout shows a lens in section with its rays: what is drawn, and the figure."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
-from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
@@ -55,7 +54,6 @@ def layout_figure(
     rays: int = 7,
     object_distance: float | None = None,
     title: str | None = None,
-    values: Mapping[str, Tensor] | None = None,
     sensor: float | None = None,
 ) -> Figure:
     """Draw the section of a lens in the y-z plane, with ray fans coloured by field or wavelength.
@@ -79,7 +77,6 @@ def layout_figure(
         rays: rays a field; one alone is the chief ray.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         title: None for the lens's name, focal length and F-number.
-        values: lens parameters to use instead of the stored ones, as `Lens.system` takes them.
         sensor: mm, the sensor's extent in this section; None: that of the prescription.
 
     Returns:
@@ -90,7 +87,7 @@ def layout_figure(
             fields from the side), or the object is not in front of the entrance pupil and the first
             vertex.
     """
-    drawing = layout_drawing(lens, wavelength, fields_deg, rays, object_distance, values, sensor)
+    drawing = layout_drawing(lens, wavelength, fields_deg, rays, object_distance, sensor)
     system = drawing.system
     plates = [
         number
@@ -243,13 +240,12 @@ def layout_drawing(
     fields_deg: Sequence[float],
     rays: int,
     object_distance: float | None = None,
-    values: Mapping[str, Tensor] | None = None,
     sensor: float | None = None,
 ) -> LayoutDrawing:
     """Section a lens and trace its rays; arguments and errors are those of `layout_figure`."""
     sensor = sensor or lens.sensor_diameter
     lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
-    system = lens.system(values)
+    system = lens.system()
     _check(fields_deg, rays, lines, 180.0 if system.from_the_side else 90.0)
     profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
     # The sensor's middle, and the sections of all surfaces.

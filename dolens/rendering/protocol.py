@@ -86,7 +86,6 @@ class Renderer(ABC):
         scene: Scene,
         textures: Tensor,
         seed: int,
-        values: Values | None = None,
     ) -> Tensor:
         """Image textures as a scene shows them.
 
@@ -95,11 +94,10 @@ class Renderer(ABC):
             scene: planes, wavelengths, and what textures mean.
             textures: (B, channels, H, W), linear light, as the scene takes them.
             seed: of all random numbers; the same seed gives the same image.
-            values: lens parameters to use instead of the stored ones.
 
         Returns:
             (B, images, C, height, width), linear light, in the lens's precision; of a planar scene
-            an image for each depth.  Differentiable in the lens's parameters, `values` and the
+            an image for each depth.  Differentiable in the lens's parameters and values and the
             textures.
 
         Raises:
@@ -113,7 +111,6 @@ class Renderer(ABC):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Values | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own; here one after the other.
 
@@ -123,7 +120,6 @@ class Renderer(ABC):
             textures: (W, channels, h, w).
             windows: W of one size, of the renderer's sensor.
             seed: the i-th window has seed + i.
-            values: lens parameters.
 
         Returns:
             (W, images, C, height, width).
@@ -132,7 +128,7 @@ class Renderer(ABC):
         for i, (window, texture) in enumerate(zip(windows, textures, strict=True)):
             placed = replace(scene, texture_centre=window.texture_centre)
             renderer = self.on(window.sensor)
-            images.append(renderer.render(lens, placed, texture[None], seed + i, values))
+            images.append(renderer.render(lens, placed, texture[None], seed + i))
         return torch.cat(images)
 
     def render_share(
@@ -142,7 +138,6 @@ class Renderer(ABC):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Values | None,
         share: WindowShare,
     ) -> Tensor:
         """Image each texture on its window as `render_windows` does where all windows are together.
@@ -153,10 +148,9 @@ class Renderer(ABC):
             textures: (W, channels, h, w), of this share.
             windows: W, of this share.
             seed: of the whole batch.
-            values: lens parameters.
             share: where these windows stand among all.
         """
-        return self.render_windows(lens, scene, textures, windows, seed + share.first, values)
+        return self.render_windows(lens, scene, textures, windows, seed + share.first)
 
     def rays_per_image(self, scene: Scene, sensor: Sensor | None = None) -> int:
         """Rays traced through the lens for one render, all wavelengths together.
@@ -186,7 +180,7 @@ class Renderer(ABC):
         """
         return self.on(sensor)
 
-    def with_pupil(self, lens: Lens, scene: Scene, values: Values | None = None) -> Self:
+    def with_pupil(self, lens: Lens, scene: Scene) -> Self:
         """The renderer with what it may keep of the lens's pupil as long as the lens hardly
         changes; here nothing.
         """
@@ -200,7 +194,6 @@ class Renderer(ABC):
         self,
         lens: Lens,
         scene: Scene,
-        values: Values | None = None,
         measure: Measure | None = None,
         photographs: Tensor | None = None,
     ) -> None:
@@ -209,7 +202,6 @@ class Renderer(ABC):
         Args:
             lens: as of `render`, and the scene.
             scene: planes and wavelengths.
-            values: parameters of the lens as it is now.
             measure: the variables and the loss whose gradients matter; None: not said.
             photographs: (P, 3, h, w), linear light: what scenes look like.
         """

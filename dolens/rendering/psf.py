@@ -3,7 +3,6 @@ which are binned into pixels and looked up between them.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -30,7 +29,6 @@ def axial_point_spread_functions(
     sensor: Sensor,
     size: int = 65,
     pupil_samples: int = 64,
-    values: Mapping[str, Tensor] | None = None,
     centred: bool = False,
 ) -> Tensor:
     """Point spread functions on the axis, at every depth and wavelength of a scene.
@@ -48,15 +46,14 @@ def axial_point_spread_functions(
         centred: the chief ray of the lens's reference wavelength falls there instead, as in an
             image that is registered by its chief rays: those of a tilted lens leave the axis.
         pupil_samples: strata along each side of the pupil.
-        values: lens parameters to use instead of the stored ones.
 
     Returns:
         (depths, wavelengths, size, size), upright like an image, each of unit sum less what lands
-        outside the window.  Differentiable in the lens's parameters and `values`.
+        outside the window.  Differentiable in the lens's parameters and values.
     """
     if size < 3 or size % 2 == 0:
         raise InputError(f"psf size must be odd and at least 3, not {size}")
-    system = lens.system(values)
+    system = lens.system()
     scene.check(system)
     u, v = regular_square(pupil_samples, system.dtype, system.device)
     disc_x, disc_y = square_to_disc(u, v)

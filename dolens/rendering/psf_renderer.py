@@ -124,14 +124,13 @@ class PsfRenderer(Renderer):
         scene: Scene,
         textures: Tensor,
         seed: int,
-        values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Image textures as a scene shows them; see `Renderer.render`.
 
         The seed is of the points in the pupil's strata.
         """
         whole = SensorWindow(self.sensor, scene.texture_centre)
-        (image,) = self._render(lens, scene, [(whole, textures)], seed, values)
+        (image,) = self._render(lens, scene, [(whole, textures)], seed)
         return image
 
     def render_windows(
@@ -141,7 +140,6 @@ class PsfRenderer(Renderer):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own, all at once; see `Renderer.render_windows`.
 
@@ -149,7 +147,7 @@ class PsfRenderer(Renderer):
         one set of polynomials gives the object points of all windows.
         """
         shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
-        return torch.cat(self._render(lens, scene, shown, seed, values))
+        return torch.cat(self._render(lens, scene, shown, seed))
 
     def render_share(
         self,
@@ -158,12 +156,11 @@ class PsfRenderer(Renderer):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Mapping[str, Tensor] | None,
         share: WindowShare,
     ) -> Tensor:
         """Image each texture on its window, one of a larger batch; see `Renderer.render_share`."""
         shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
-        return torch.cat(self._render(lens, scene, shown, seed, values, share))
+        return torch.cat(self._render(lens, scene, shown, seed, share))
 
     def _render(
         self,
@@ -171,7 +168,6 @@ class PsfRenderer(Renderer):
         scene: Scene,
         shown: Sequence[tuple[SensorWindow, Tensor]],
         seed: int,
-        values: Mapping[str, Tensor] | None,
         share: WindowShare | None = None,
     ) -> list[Tensor]:
         """Images (B, images, C, height, width) of windows of the sensor and textures that are shown
@@ -180,7 +176,7 @@ class PsfRenderer(Renderer):
         options: dict[str, Any] = {"device": lens.device, "dtype": lens.dtype}
         textures = [texture.to(**options) for _, texture in shown]
         windows = [window.sensor for window, _ in shown]
-        system = with_chosen_backend(lens.system(values), textures)
+        system = with_chosen_backend(lens.system(), textures)
         with torch.no_grad():
             scene.check(system)
             pupil = self.pupil
@@ -276,11 +272,9 @@ class PsfRenderer(Renderer):
         )
         return found._replace(functions=blurred)
 
-    def with_pupil(
-        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
-    ) -> "PsfRenderer":
+    def with_pupil(self, lens: Lens, scene: Scene) -> "PsfRenderer":
         """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
-        system = lens.system(values)
+        system = lens.system()
         return replace(self, pupil=sampled_exit_pupil(system, scene.wavelengths, self.sensor))
 
     def without_diffraction(self) -> "PsfRenderer":

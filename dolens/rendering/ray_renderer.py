@@ -5,7 +5,7 @@ images of their own, and PyTorch's operations, the reference that they must equa
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -98,28 +98,24 @@ class RayRenderer(Renderer):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own; see `Renderer.render_windows`."""
-        axial, images = self.axial_pupil(lens, scene, values), []
+        axial, images = self.axial_pupil(lens, scene), []
         for i, window in enumerate(windows):
             renderer = self.on(window.sensor)
             placed = replace(scene, texture_centre=window.texture_centre)
             texture = textures[i : i + 1]
-            images.append(renderer.render(lens, placed, texture, seed + i, values, axial))
+            images.append(renderer.render(lens, placed, texture, seed + i, axial))
         return torch.cat(images)
 
-    def axial_pupil(
-        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
-    ) -> ExitPupil:
+    def axial_pupil(self, lens: Lens, scene: Scene) -> ExitPupil:
         """Find the axial exit pupil once, for many renders of the same lens.
 
         Raises:
             InputError: no ray from the sensor's centre gets through.
         """
-        still = {name: value.detach() for name, value in (values or {}).items()}
-        system = lens.system(still)
-        return axial_exit_pupil(system, scene.wavelengths)
+        still = {name: value.detach() for name, value in lens.given.items()}
+        return axial_exit_pupil(lens.system(still), scene.wavelengths)
 
     def render(
         self,
@@ -127,7 +123,6 @@ class RayRenderer(Renderer):
         scene: Scene,
         textures: Tensor,
         seed: int,
-        values: Mapping[str, Tensor] | None = None,
         axial: ExitPupil | None = None,
     ) -> Tensor:
         """Image textures as a scene shows them.
@@ -137,19 +132,18 @@ class RayRenderer(Renderer):
             scene: planes, wavelengths, and what textures mean.
             textures: (B, channels, H, W), linear light, as the scene takes them.
             seed: the same seed gives the same samples, whatever ran before.
-            values: lens parameters to use instead of the stored ones.
-            axial: what `axial_pupil` found for this lens and these values; None: it is asked here.
+            axial: what `axial_pupil` found for this lens; None: it is asked here.
 
         Returns:
             (B, images, C, height, width), linear light, in the lens's precision; of a planar scene
-            an image for each depth.  Differentiable in the lens's parameters, `values` and the
+            an image for each depth.  Differentiable in the lens's parameters and values and the
             textures.
 
         Raises:
             InputError: a depth inside the lens, or channels that are not the scene's.
         """
         stored = {n: p for n, p in lens.named_parameters() if p.requires_grad}
-        parameters = {**stored, **(values or {})}
+        parameters = {**stored, **lens.given}
         textures = textures.to(device=lens.device, dtype=lens.dtype)
         shown = scene.on_planes(textures)
         system = with_chosen_backend(lens.system(parameters), [textures])

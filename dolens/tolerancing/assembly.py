@@ -2,7 +2,6 @@
 design is less sensitive where the spots of such lenses spread less.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -92,7 +91,6 @@ def best_focus(system: OpticalSystem, target: FocusTarget) -> Tensor:
 
 def assembled(
     lens: Lens,
-    values: Mapping[str, Tensor],
     tolerances: Tolerances,
     errors: Tensor,
     target: FocusTarget | None,
@@ -106,12 +104,12 @@ def assembled(
 
     Args:
         lens: as designed.
-        values: parameters of the design in place of the stored ones.
         tolerances: name the P parameters that are off.
         errors: (P,), in the lens's units.
         target: what the line focuses by; None: the sensor stays at its nominal distance.
     """
     stored = {**fabrication_errors(lens), **dict(lens.named_parameters())}
+    values = lens.given
     made = dict(values)
     for name, error in zip(tolerances.names, errors.unbind(), strict=True):
         nominal = values.get(name, stored[name])
@@ -121,14 +119,13 @@ def assembled(
     left_over = made.pop(SENSOR, None)
     nominal = values.get(SENSOR, stored[SENSOR])
     unfocused = made | {SENSOR: nominal}
-    shift = best_focus(lens.system(unfocused), target) - best_focus(lens.system(values), target)
+    shift = best_focus(lens.system(unfocused), target) - best_focus(lens.system(), target)
     made[SENSOR] = (nominal if left_over is None else left_over) + shift
     return made
 
 
 def expected_spread(
     lens: Lens,
-    values: Mapping[str, Tensor],
     tolerances: Tolerances,
     spots: SpotRays,
     target: FocusTarget | None,
@@ -147,12 +144,11 @@ def expected_spread(
 
     Args:
         lens: as designed.
-        values: parameters of the design in place of the stored ones.
         tolerances: what may be off.
         spots: rays of the whole pupil.
         target: what lenses are focused by; None: they are not.
     """
-    reference = lens.system(values).traced_by("reference")
+    reference = lens.system().traced_by("reference")
     dtype, device = reference.dtype, reference.device
     ray = Components(*(c.to(device, dtype) for c in spots.rays.components()))
     wavelength = spots.rays.wavelength
@@ -160,7 +156,7 @@ def expected_spread(
     spot = spots.spot.to(device)
 
     def points(errors: Tensor) -> Tensor:
-        made = assembled(lens, values, tolerances, errors, target)
+        made = assembled(lens, tolerances, errors, target)
         system = lens.system(made).traced_by("reference")
         at = trace_to_sensor(system, trace_surfaces(system, ray, wavelength), wavelength).ray
         return torch.stack([at.x, at.y], -1)

@@ -151,22 +151,20 @@ class Manufacture:
         """Return whether a network is given the same functions for all lenses, the design's."""
         return self.settings.calibration == "design"
 
-    def for_step(self, lens: Lens, values: Mapping[str, Tensor], step: int) -> list[MadeLens]:
+    def for_step(self, lens: Lens, step: int) -> list[MadeLens]:
         """Return the lenses of a training step, differentiable in the design."""
-        return self._made(lens, values, self.settings.lenses_per_step, step)
+        return self._made(lens, self.settings.lenses_per_step, step)
 
-    def tested(self, lens: Lens, values: Mapping[str, Tensor], number: int) -> MadeLens:
+    def tested(self, lens: Lens, number: int) -> MadeLens:
         """Return one of the lenses that judge a camera; the same of every camera."""
-        return self._made(lens, values, 1, _TESTED + number)[0]
+        return self._made(lens, 1, _TESTED + number)[0]
 
-    def _made(
-        self, lens: Lens, values: Mapping[str, Tensor], count: int, number: int
-    ) -> list[MadeLens]:
+    def _made(self, lens: Lens, count: int, number: int) -> list[MadeLens]:
         # Lenses of a test must be the same whatever the seed of a training is.
         seed = 0 if number >= _TESTED else self._views.seed
         generator = generator_of(seed_of(seed, "train", _OFFSET + number))
         return [
-            MadeLens(assembled(lens, values, self.tolerances, errors, self._target), errors, number)
+            MadeLens(assembled(lens, self.tolerances, errors, self._target), errors, number)
             for errors in self.tolerances.draw(count, generator)
         ]
 
@@ -193,13 +191,12 @@ class Manufacture:
         # The noise is held in the derivative as it is in the value.
         return own + (measured - own).detach()
 
-    def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+    def penalty(self, lens: Lens) -> Tensor:
         """Return what sensitivity adds to the loss, ()."""
         if not self._spots:
             return torch.zeros((), dtype=lens.dtype, device=lens.device)
         spreads = [
-            expected_spread(lens, values, self.tolerances, spots, self._target)
-            for spots in self._spots
+            expected_spread(lens, self.tolerances, spots, self._target) for spots in self._spots
         ]
         mean = torch.stack(spreads).mean() / self._pitch**2
         return self.settings.desensitising * mean

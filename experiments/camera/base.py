@@ -134,7 +134,7 @@ class Camera(Experiment):
             share: of a larger batch, whose random numbers these textures have their part of.
         """
         with self.exact():
-            images = (self.lens, values, batch, stage, index, reference)
+            images = (self.lens.with_values(values), batch, stage, index, reference)
             # Views that know no shares are asked for none.
             taken = self.views.take(*images) if share is None else self.views.take(*images, share)
             return taken, self.functions(values, taken, stage)
@@ -175,10 +175,10 @@ class Camera(Experiment):
         """
         if not self.network.needs_point_spread_function:
             return None
-        own = None
+        own, lens = None, self.lens.with_values(values)
         if self.network.takes_functions_of_images:
-            own = self.views.functions_of_images(self.lens, values, taken, stage)
-        return self.views.point_spread_functions(self.lens, values) if own is None else own
+            own = self.views.functions_of_images(lens, taken, stage)
+        return self.views.point_spread_functions(lens) if own is None else own
 
     def comparison(self) -> Comparison | None:
         """Return the loss as a function of images, for a renderer that compares gradients.

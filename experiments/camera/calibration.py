@@ -26,7 +26,6 @@ class Miscalibration(Protocol):
         self,
         views: Imaging,
         lens: Lens,
-        values: Mapping[str, Tensor],
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
@@ -35,7 +34,6 @@ class Miscalibration(Protocol):
         Args:
             views: those of the camera.
             lens: the lens that took the images.
-            values: its variables.
             exact: (views, 3, K, K), its own functions.
             generator: on the CPU, for this batch.
         """
@@ -57,12 +55,11 @@ class OtherDepth:
         self,
         views: Imaging,
         lens: Lens,
-        values: Mapping[str, Tensor],
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
         """Return the functions of the one plane."""
-        return views.point_spread_functions(lens, values, depths=(self.depth,))
+        return views.point_spread_functions(lens, depths=(self.depth,))
 
 
 class OtherSample:
@@ -83,15 +80,14 @@ class OtherSample:
         self,
         views: Imaging,
         lens: Lens,
-        values: Mapping[str, Tensor],
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
         """Return the functions of a lens whose errors are drawn."""
         tolerances = tolerances_from(lens, self.tolerances, self.factor)
         (errors,) = tolerances.draw(1, generator)
-        made = assembled(lens, values, tolerances, errors, None)
-        return views.point_spread_functions(lens, made)
+        made = assembled(lens, tolerances, errors, None)
+        return views.point_spread_functions(lens.with_values(made))
 
 
 class NoisyMeasurement:
@@ -115,7 +111,6 @@ class NoisyMeasurement:
         self,
         views: Imaging,
         lens: Lens,
-        values: Mapping[str, Tensor],
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:

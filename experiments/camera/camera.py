@@ -220,7 +220,8 @@ class CameraModule(Camera):
         if self.trainer.is_global_zero:
             with named_stage("looking at the lens"):
                 photographs = self._photographs()
-                self.views.prepare(self.lens, self.variables(), self.comparison(), photographs)
+                lens = self.lens.with_values(self.variables())
+                self.views.prepare(lens, self.comparison(), photographs)
         if processes() > 1:  # plans are made by the clock too: what one process found serves all
             found = self.trainer.strategy.broadcast(self.views.state())
             if not self.trainer.is_global_zero:
@@ -256,7 +257,7 @@ class CameraModule(Camera):
         with self.exact():
             penalty, operands = self.lens_steps.penalty(values)
             if self.manufacture is not None and self.manufacture.settings.desensitising:
-                sensitivity = self.manufacture.penalty(self.lens, values)
+                sensitivity = self.manufacture.penalty(self.lens.with_values(values))
                 self.log("train/sensitivity", sensitivity.detach().float())
                 penalty = penalty + sensitivity.to(penalty)
         total = terms["total"]

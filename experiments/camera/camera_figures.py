@@ -108,13 +108,13 @@ def _point_spread_functions(camera: Camera) -> Figure:
 
 def _whole_functions(camera: Camera) -> Tensor:
     """Return point spread functions in a window that cuts next to nothing off."""
-    lens, values, views = camera.lens, camera.variables(), camera.views
-    found = views.point_spread_functions(lens, values, _PUPIL_SAMPLES)
+    lens, views = camera.lens.with_values(camera.variables()), camera.views
+    found = views.point_spread_functions(lens, _PUPIL_SAMPLES)
     while True:
         size = 2 * found.shape[-1] - 1
         if size > _LARGEST_WINDOW:
             return found
-        wider = views.point_spread_functions(lens, values, _PUPIL_SAMPLES, size=size)
+        wider = views.point_spread_functions(lens, _PUPIL_SAMPLES, size=size)
         held = found.sum((-3, -2, -1)) >= _HELD * wider.sum((-3, -2, -1))
         if bool(held.all()):
             return found

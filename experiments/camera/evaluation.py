@@ -90,7 +90,7 @@ class Evaluation:
             with named_stage(f"calibration {kind}"):
                 with camera.exact():
                     wrong = calibration.functions(
-                        camera.views, camera.lens, values, exact, generator
+                        camera.views, camera.lens.with_values(values), exact, generator
                     )
                 restored = camera.restore(taken, wrong).clamp(0.0, 1.0)
             row = {f"psnr_db_miscalibrated/{kind}": _compared(psnr_db, restored, taken.truth)}
@@ -220,7 +220,8 @@ def _of_plain_exposure(
 ) -> dict[str, Tensor]:
     """Return scores (B, V) of what the network restores of a plain lens's images, if any."""
     with camera.exact():
-        found = camera.views.plain_exposure(camera.lens, values, batch, "test", index, reference)
+        lens = camera.lens.with_values(values)
+        found = camera.views.plain_exposure(lens, batch, "test", index, reference)
     if found is None:
         return {}
     taken, functions, noise = found
@@ -294,11 +295,12 @@ def restored_by_rivals(
         functions: that the camera's network was told; None where it asks for none.
         values: of the lens's variables.
     """
+    lens = camera.lens.with_values(values)
     if functions is None or functions.ndim == taken.given.ndim:  # not of each image its own
-        own = camera.views.functions_of_images(camera.lens, values, taken, "test")
+        own = camera.views.functions_of_images(lens, taken, "test")
         functions = functions if own is None else own
     if functions is None:
-        functions = camera.views.point_spread_functions(camera.lens, values)
+        functions = camera.views.point_spread_functions(lens)
     rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
     noise = torch.tensor(camera.views.noise)
     return {

@@ -53,20 +53,19 @@ class CameraOperands:
         check_operand_fields(self.entries, self.object_distance)
         self.taken_back = 0
 
-    def penalty(self, lens: Lens, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def penalty(self, lens: Lens) -> tuple[Tensor, dict[str, Tensor]]:
         """Return Σ (weight·deviation)² and the operands' values by label.
 
         They are of the lens in none of its states.
 
         Args:
-            lens: that they belong to.
-            values: parameters that take the place of its own, by name; with a graph.
+            lens: that they belong to; they are differentiable in its given values.
 
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        own = values_in_state(lens, None, values)
-        found = evaluate_operands(self.entries, lens, own, self.object_distance)
+        own = values_in_state(lens, None, lens.given)
+        found = evaluate_operands(self.entries, lens.as_stored(), own, self.object_distance)
         total = torch.zeros((), device=lens.device)
         for penalty in found.penalties():
             total = total + penalty
@@ -83,13 +82,13 @@ class CameraOperands:
             return None
         return OperandModel.at(lens, variables, self.entries, self.object_distance)
 
-    def check(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+    def check(self, lens: Lens) -> None:
         """Refuse a lens that training cannot begin with.
 
         Raises:
             InputError: a chief ray does not reach the stop.
         """
-        problem = self._problem(lens, values)
+        problem = self._problem(lens)
         if problem is not None:
             raise InputError(f"operands: {problem} of lens '{lens.name}' as training begins")
 
@@ -105,7 +104,7 @@ class CameraOperands:
             before: u before it.
             forget: called then, to drop what led there: momentum, or too long a trust radius.
         """
-        problem = self._problem(lens, variables())
+        problem = self._problem(lens.with_values(variables()))
         if problem is None:
             return
         variables.scaled.copy_(before)
@@ -118,9 +117,9 @@ class CameraOperands:
         )
 
     @torch.no_grad()
-    def _problem(self, lens: Lens, values: Mapping[str, Tensor]) -> UnreachableField | None:
+    def _problem(self, lens: Lens) -> UnreachableField | None:
         try:
-            self.penalty(lens, values)
+            self.penalty(lens)
         except UnreachableField as problem:
             return problem
         return None

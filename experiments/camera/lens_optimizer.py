@@ -274,7 +274,7 @@ class LensSteps:
         self._spots = views.spots(lens, least_squares.rings, least_squares.arms) if apart else []
         self._views = views
         self.first: DeconvolvedDesign | None = None
-        operands.check(lens, variables())
+        operands.check(lens.with_values(variables()))
 
     @property
     def apart(self) -> bool:
@@ -309,7 +309,7 @@ class LensSteps:
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the operands add to the loss, and their values by label."""
-        return self.operands.penalty(self.lens, values)
+        return self.operands.penalty(self.lens.with_values(values))
 
     def finish(
         self, optimizer: torch.optim.Optimizer, before: Tensor, steps: int, share: float

@@ -46,7 +46,7 @@ def training_images(
         taken, functions = camera.take(values, batch, "train", step, share=share)
         return taken, [functions]
     with camera.exact():
-        lenses = manufacture.for_step(camera.lens, values, step)
+        lenses = manufacture.for_step(camera.lens.with_values(values), step)
         return images_of_made_lenses(camera, manufacture, lenses, values, batch, share)
 
 
@@ -83,7 +83,8 @@ def images_of_made_lenses(
         part = batch[number * size : (number + 1) * size]
         own = BatchShare(whole.first + number * size, whole.total)
         alone = own.total == len(part)
-        arguments = (camera.lens, made.values, part, "train", camera.global_step, None)
+        lens = camera.lens.with_values(made.values)
+        arguments = (lens, part, "train", camera.global_step, None)
         # Views that know no shares are asked for none.
         taken.append(camera.views.take(*arguments) if alone else camera.views.take(*arguments, own))
         if functions and manufacture.gives_the_design_s_functions and not camera.knows_places:
@@ -279,7 +280,7 @@ def made_lens_scores(
     started = time.perf_counter()
 
     def taken_by(values: Mapping[str, Tensor]) -> Views:
-        return judging.take(camera.lens, values, crops, "test", 0)
+        return judging.take(camera.lens.with_values(values), crops, "test", 0)
 
     def scores(taken: Views, functions: Tensor | None) -> Tensor:
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)
@@ -295,7 +296,7 @@ def made_lens_scores(
         rows, errors = [], []
         for number in range(manufacture.settings.tested):
             with camera.exact():
-                made = manufacture.tested(camera.lens, design, number)
+                made = manufacture.tested(camera.lens.with_values(design), number)
                 taken, functions = taken_by(made.values), of_design
                 if not manufacture.gives_the_design_s_functions:
                     told = partial(camera.functions, taken=taken, stage="train")

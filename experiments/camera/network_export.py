@@ -198,7 +198,9 @@ def exportable(
     functions = None
     if network.needs_point_spread_function:
         with torch.no_grad():
-            functions = camera.views.point_spread_functions(camera.lens, camera.variables())
+            functions = camera.views.point_spread_functions(
+                camera.lens.with_values(camera.variables())
+            )
         functions = functions.detach().cpu().to(network.dtype)
     if multiple is not None:
         if size is None:

@@ -70,7 +70,8 @@ class PictureCamera:
         self.camera.to(device)
         self.device = device
         with torch.no_grad():
-            self.values = {n: v.detach() for n, v in self.camera.variables().items()}
+            values = {n: v.detach() for n, v in self.camera.variables().items()}
+            self.lens = self.camera.lens.with_values(values)
             self.functions = self._functions()
         self.margin: int | None = None
         self._chosen = DEFAULT_WINDOW  # by place for the last picture
@@ -90,7 +91,7 @@ class PictureCamera:
         network, views = self.camera.network, self.camera.views
         if not network.needs_point_spread_function or self.camera.knows_places:
             return None
-        return views.point_spread_functions(self.camera.lens, self.values)
+        return views.point_spread_functions(self.lens)
 
     @property
     def window(self) -> int:
@@ -126,7 +127,7 @@ class PictureCamera:
     def _at_depth(self, linear: Tensor, depth: float, name: str, folder: Path) -> Applied:
         views, options = self.camera.views, self.options
         placing = Placing(depth, options.scale, options.diffraction, options.seed)
-        taken = views.whole_picture(self.camera.lens, self.values, linear, placing)
+        taken = views.whole_picture(self.lens, linear, placing)
         generator = torch.Generator(taken.image.device).manual_seed(options.seed)
         with torch.no_grad():
             signal = views.sensed(taken.image, generator)
@@ -167,7 +168,7 @@ class PictureCamera:
         camera, readout = self.camera, self.camera.views.readout
         if camera.knows_places:
             size = (signal.shape[-2], signal.shape[-1])
-            known = camera.views.by_place(camera.lens, self.values, size, placing)
+            known = camera.views.by_place(self.lens, size, placing)
             assert known is not None  # as the camera knows places
             self._chosen = known.window
             told = (known.functions, known.illumination, self.window)

@@ -148,7 +148,7 @@ def layout(lens: Lens, shown: Shown) -> Figure:
     wavelength = lens.reference_wavelength or _LINE_NM
     if shown.tilt_x:
         values = {"elements.lens.tilt_x": torch.tensor(shown.tilt_x).deg2rad()}
-        return layout_figure(_as_element(lens), wavelength, shown.fields, values=values)
+        return layout_figure(_as_element(lens).with_values(values), wavelength, shown.fields)
     return layout_figure(lens, wavelength, shown.fields, object_distance=shown.object_distance)
 
 

@@ -97,7 +97,7 @@ def render_contenders(
     for model, diffraction in (("auto", False), ("auto with diffraction", True)):
         for tolerance in tolerances:
             auto = AutoRenderer(sensor, tolerance, diffraction=diffraction)
-            auto.make_plan(subject.lens, subject.scene, values)
+            auto.make_plan(subject.lens.with_values(values), subject.scene)
             plans.append(Contender(model, f"{model}, {tolerance:g} grey levels", auto))
     found = [Contender("rays", f"{n * n} rays", RayRenderer(sensor, n)) for n in samples]
     sizes = [p.renderer.psf_size for p in plans]
@@ -226,7 +226,7 @@ def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> di
 
     def rendered(renderer: Renderer) -> Render:
         def render(values: Mapping[str, Tensor], seed: int) -> Tensor:
-            return renderer.render(lens, scene, texture, seed, values)
+            return renderer.render(lens.with_values(values), scene, texture, seed)
 
         return render
 

@@ -119,7 +119,7 @@ def _geometric(
     planes = PlanarScene(scene.depths, _LINES[1:2])
     values = {"sensor_distance": torch.tensor(focus)}
     sensor = Sensor(128, 128, scene.pitch)
-    found = axial_point_spread_functions(lens, planes, sensor, _SIZE, _SAMPLES, values)
+    found = axial_point_spread_functions(lens.with_values(values), planes, sensor, _SIZE, _SAMPLES)
     n = axial_f_number(lens)
     return with_diffraction_limit(found, scene.pitch, planes.wavelengths, n)[:, 0]
 
@@ -220,7 +220,7 @@ def wave_functions(camera: DepthCamera, scene: Range) -> Tensor:
     for focus in camera.foci:
         values = {"sensor_distance": torch.tensor(focus)}
         found += [
-            axial_function(lens, values, PlanarScene((z,), _LINES), sensor, 65, "wave")
+            axial_function(lens.with_values(values), PlanarScene((z,), _LINES), sensor, 65, "wave")
             for z in scene.depths
         ]
     size = max(one.shape[-1] for one in found)

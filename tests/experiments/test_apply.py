@@ -142,8 +142,8 @@ def test_a_small_picture_is_imaged_as_rays_image_it(camera):
     scene = at_depth(camera.views.scene, 6000.0, lens)
     sensor = Sensor(16, 16, camera.views.sensor.pixel_pitch)
     texture = torch.nn.functional.interpolate(torch.rand(1, 3, 13, 13), size=(80, 80))[0]
-    rays = RayRenderer(sensor, 24).render(lens, scene, texture[None], 0, values)[0, 0]
-    functions = axial_function(lens, values, scene, sensor, 33, "none")
+    rays = RayRenderer(sensor, 24).render(lens.with_values(values), scene, texture[None], 0)[0, 0]
+    functions = axial_function(lens.with_values(values), scene, sensor, 33, "none")
     image = convolved(texture, functions)[:, 32:48, 32:48]
     assert (image - rays).abs().max() < 0.02 and (image - rays).square().mean().sqrt() < 0.005
 
@@ -152,7 +152,7 @@ def test_nearer_than_the_run_s_depths_the_blur_keeps_its_light(camera):
     """At 1.5 m the lens is far out of focus, and the function's window has grown."""
     scene = at_depth(camera.views.scene, 1500.0, camera.lens)
     functions = axial_function(
-        camera.lens, dict(camera.variables()), scene, camera.views.sensor, 33, "none"
+        camera.lens.with_values(camera.variables()), scene, camera.views.sensor, 33, "none"
     )
     assert functions.shape[-1] > 33
     assert (functions.sum((-2, -1)) - 1.0).abs().max() < 0.01

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from functools import partial
 
 import pytest
 import torch
@@ -92,7 +91,7 @@ def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
     module = camera("as_built.factor=1e-9", "as_built.lenses_per_step=2")
     design, batch = module.variables(), textures()
     drawn, functions = module.take(design, batch, "train", 0)
-    made = module.manufacture.for_step(module.lens, design, 0)
+    made = module.manufacture.for_step(module.lens.with_values(design), 0)
     assert len(made) == 2
     taken, own = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
     # The sensor's noise too is that of the whole batch.
@@ -106,17 +105,19 @@ def test_errors_at_another_factor_are_in_proportion(camera):
     module = camera("as_built.factor=2")
     design = module.variables()
     wide = module.manufacture.at_factor(6.0)
-    one, other = (m.tested(module.lens, design, 3).errors for m in (module.manufacture, wide))
+    one, other = (
+        m.tested(module.lens.with_values(design), 3).errors for m in (module.manufacture, wide)
+    )
     torch.testing.assert_close(other, 3.0 * one)
 
 
 def test_each_lens_has_its_part_of_the_batch(camera):
     module = camera("as_built.lenses_per_step=2", "as_built.calibration=own")
     design, batch = module.variables(), textures()
-    made = module.manufacture.for_step(module.lens, design, 3)
+    made = module.manufacture.for_step(module.lens.with_values(design), 3)
     taken, own = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
     for number, lens in enumerate(made):
-        functions = module.views.point_spread_functions(module.lens, lens.values)
+        functions = module.views.point_spread_functions(module.lens.with_values(lens.values))
         torch.testing.assert_close(own[number], functions)
     assert (own[0] - own[1]).abs().max() > 1e-4
     assert taken.raw.shape[0] == 2
@@ -124,9 +125,13 @@ def test_each_lens_has_its_part_of_the_batch(camera):
 
 def test_judging_lenses_are_those_of_every_seed_and_no_training_s(camera):
     one, other = camera(), camera("seed=7")
-    first, again = (m.manufacture.tested(m.lens, m.variables(), 4) for m in (one, other))
+    first, again = (
+        m.manufacture.tested(m.lens.with_values(m.variables()), 4) for m in (one, other)
+    )
     assert torch.equal(first.errors, again.errors)
-    trained = [m.manufacture.for_step(m.lens, m.variables(), 4)[0] for m in (one, other)]
+    trained = [
+        m.manufacture.for_step(m.lens.with_values(m.variables()), 4)[0] for m in (one, other)
+    ]
     assert not torch.equal(trained[0].errors, trained[1].errors)
     assert not torch.equal(first.errors, trained[0].errors)
 
@@ -151,7 +156,7 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
     def loss(at):
         scaled.data.copy_(at)
         values = module.variables()
-        made = manufacture.for_step(module.lens, values, 2)
+        made = manufacture.for_step(module.lens.with_values(values), 2)
         taken, own = images_of_made_lenses(module, manufacture, made, values, batch, None)
         return (taken.raw.double() * weight).sum() + 100.0 * own[0].double().square().sum()
 
@@ -170,10 +175,13 @@ def test_the_image_of_a_made_lens_is_differentiable_in_the_design(camera):
 def test_measured_functions_keep_their_light_and_the_derivative_of_the_exact_ones(camera):
     module = camera("as_built.calibration=measured", "as_built.electrons=1000")
     design = module.variables()
-    made = module.manufacture.tested(module.lens, design, 0)
-    told = partial(module.views.point_spread_functions, module.lens)
+    made = module.manufacture.tested(module.lens.with_values(design), 0)
+
+    def told(values):
+        return module.views.point_spread_functions(module.lens.with_values(values))
+
     measured = module.manufacture.functions(told, design, made)
-    exact = module.views.point_spread_functions(module.lens, made.values)
+    exact = module.views.point_spread_functions(module.lens.with_values(made.values))
     assert (measured - exact).abs().max() > 1e-3
     torch.testing.assert_close(measured.sum((-2, -1)), exact.sum((-2, -1)), rtol=1e-5, atol=1e-6)
     weight = torch.rand(exact.shape[-2:], generator=torch.Generator().manual_seed(0)).to(exact)
@@ -194,8 +202,8 @@ def test_the_image_of_a_shifted_lens_is_registered_by_its_chief_ray(camera):
         "surfaces.5.y3": torch.zeros((), dtype=torch.float64),
     }
     views, lens = module.views, module.lens
-    centred = views.point_spread_functions(lens, values, size=65)
-    apart = axial_point_spread_functions(lens, views.scene, views.sensor, 65, 8, values)
+    centred = views.point_spread_functions(lens.with_values(values), size=65)
+    apart = axial_point_spread_functions(lens.with_values(values), views.scene, views.sensor, 65, 8)
     column = torch.arange(65, dtype=centred.dtype) - 32
 
     def mean(functions):
@@ -207,19 +215,21 @@ def test_the_image_of_a_shifted_lens_is_registered_by_its_chief_ray(camera):
     assert mean(centred).abs().max() < 0.5
     # A lens without errors has its chief ray on the axis.
     same = axial_point_spread_functions(lens, views.scene, views.sensor, 33, 8)
-    assert torch.equal(views.point_spread_functions(lens, {}), same)
+    assert torch.equal(views.point_spread_functions(lens), same)
 
 
 def test_sensitivity_counts_in_the_loss_by_its_weight(camera):
     module = camera("as_built.desensitising=0.5")
     twice = camera("as_built.desensitising=1.0")
     small = camera("as_built.desensitising=1.0", "as_built.factor=0.1")
-    found = [m.manufacture.penalty(m.lens, m.variables()) for m in (module, twice, small)]
+    found = [
+        m.manufacture.penalty(m.lens.with_values(m.variables())) for m in (module, twice, small)
+    ]
     torch.testing.assert_close(2.0 * found[0], found[1])
     torch.testing.assert_close(found[1], 100.0 * found[2], rtol=1e-6, atol=0.0)
     (slope,) = torch.autograd.grad(found[1], twice.variables.scaled)
     assert slope.abs().max() > 0.0
-    assert float(camera().manufacture.penalty(module.lens, module.variables())) == 0.0
+    assert float(camera().manufacture.penalty(module.lens.with_values(module.variables()))) == 0.0
 
 
 def test_the_worst_decile_is_the_mean_of_the_worst_tenth(camera):
@@ -278,7 +288,7 @@ def test_no_tolerances_are_not_the_lens_as_drawn(composed):
 def test_a_batch_that_lenses_cannot_share_equally_is_refused(camera):
     module = camera("as_built.lenses_per_step=2")
     design = module.variables()
-    made = module.manufacture.for_step(module.lens, design, 0)
+    made = module.manufacture.for_step(module.lens.with_values(design), 0)
     with pytest.raises(InputError, match="lenses_per_step"):
         images_of_made_lenses(module, module.manufacture, made, design, textures(3), None)
 
@@ -296,7 +306,7 @@ def test_other_cameras_are_made_with_errors_of_index_and_shape(
     assert sum(name.startswith("media.") for name in names) == glasses
     assert sum(".astigmatism_" in name for name in names) == 2 * surfaces
     design, batch = module.variables(), textures(1, 64 + 64)
-    made = module.manufacture.for_step(module.lens, design, 0)
+    made = module.manufacture.for_step(module.lens.with_values(design), 0)
     taken, _ = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
     drawn, _ = module.take(design, batch, "train", 0)
     difference = (taken.raw - drawn.raw).detach().abs().max()

@@ -29,7 +29,7 @@ def test_magnification_is_that_of_the_objects_distance(root, distance):
     """Of an object at distance s before the front focus: -f/s."""
     lens = doublet(root)
     operands = CameraOperands([{"kind": "magnification", "target": 0.0}], lens, distance)
-    penalty, values = operands.penalty(lens, {})
+    penalty, values = operands.penalty(lens)
     order = lens.first_order()
     expected = -float(order.efl / (distance + order.ffd))
     assert float(values["magnification"]) == pytest.approx(expected, rel=1e-9)
@@ -41,8 +41,8 @@ def test_fields_are_heights_of_near_objects_and_angles_of_far_ones(root):
     lens = doublet(root)
     angle = {"kind": "chief_ray_angle", "max": 5.0, "field": [0.0, 10.0]}
     height = {**angle, "field": [0.0, -1e9 * torch.tensor(10.0).deg2rad().tan().item()]}
-    (far,) = CameraOperands([angle], lens, float("inf")).penalty(lens, {})[1].values()
-    (near,) = CameraOperands([height], lens, 1e9).penalty(lens, {})[1].values()
+    (far,) = CameraOperands([angle], lens, float("inf")).penalty(lens)[1].values()
+    (near,) = CameraOperands([height], lens, 1e9).penalty(lens)[1].values()
     assert float(near) == pytest.approx(float(far), rel=1e-6)
 
 

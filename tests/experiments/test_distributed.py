@@ -141,11 +141,11 @@ def test_parts_of_a_batch_are_imaged_as_in_the_whole(root, kind):
     sensor = Sensor(24, 32, 0.08)
     renderer = RayRenderer(sensor, 2) if kind == "rays" else PsfRenderer(sensor, (2, 2), 6, 11)
     lens, views, textures = of_views(root, renderer)
-    whole = views.take(lens, {}, textures, "train", 3)
+    whole = views.take(lens, textures, "train", 3)
     for first in (0, 2):
         own = slice(first, first + 2)
         share = BatchShare(first, 4)
-        part = views.take(lens, {}, textures[own], "train", 3, None, share)
+        part = views.take(lens, textures[own], "train", 3, None, share)
         # One readout: nothing beside these.
         assert part[3:] == whole[3:] == (None, None)
         for mine, all_of_it in zip(part[:3], whole[:3], strict=True):

@@ -71,18 +71,17 @@ def test_wrong_calibrations_are_wrong_in_what_they_say(composed):
     lens, module = camera(composed)
     values = {name: value.detach() for name, value in module.variables().items()}
     views = module.views
-    exact = views.point_spread_functions(lens, values)
+    exact = views.point_spread_functions(lens.with_values(values))
     generator = torch.Generator().manual_seed(0)
 
     def found(calibration):
-        return calibration.functions(views, lens, values, exact, generator)
+        return calibration.functions(views, lens.with_values(values), exact, generator)
 
     # Of the scene's own third depth: that function and no other.
     (nearest,) = found(OtherDepth(4500.0))
     assert torch.allclose(nearest, exact[2], atol=1e-6)
-    beyond = axial_point_spread_functions(
-        lens, type(views.scene)((20000.0,), views.scene.wavelengths), views.sensor, 33, 8, values
-    )
+    far = type(views.scene)((20000.0,), views.scene.wavelengths)
+    beyond = axial_point_spread_functions(lens.with_values(values), far, views.sensor, 33, 8)
     assert torch.allclose(found(OtherDepth(20000.0)), beyond, atol=1e-6)
     # A sensor that stands 0.3 mm off at most moves the functions; one 1e-9 mm off does not.
     off = OtherSample({"sensor_distance": 0.3})
@@ -121,7 +120,8 @@ def test_the_network_s_functions_have_a_perfect_pupil_s_diffraction_where_asked(
     lens, rays = camera(composed)
     _, waves = camera(composed, "views.psf_diffraction=limit")
     sharp, blurred = (
-        m.views.point_spread_functions(lens, m.variables()).detach() for m in (rays, waves)
+        m.views.point_spread_functions(lens.with_values(m.variables())).detach()
+        for m in (rays, waves)
     )
     assert torch.allclose(sharp.sum((-2, -1)), blurred.sum((-2, -1)), rtol=1e-4)
     # The Airy disc widens a function's second moment.

@@ -110,8 +110,8 @@ def test_a_sweep_is_read_out_once_and_blurs_by_the_mean_of_its_functions(camera)
     module = camera("exposures.readouts=one", *STILL, "exposures.motion_is=known", *NOISELESS)
     bracket = camera(*STILL, *NOISELESS)
     values = module.variables()
-    each = bracket.views.point_spread_functions(bracket.lens, values)
-    one = module.views.point_spread_functions(module.lens, values)
+    each = bracket.views.point_spread_functions(bracket.lens.with_values(values))
+    one = module.views.point_spread_functions(module.lens.with_values(values))
     torch.testing.assert_close(one, each.mean(dim=0))
     swept, _ = taken(module, texture())
     apart, _ = taken(bracket, texture())
@@ -123,7 +123,7 @@ def test_known_motion_is_in_the_functions_that_restorers_are_told(camera):
     """Readouts are the truth behind them; the middle one, of which the truth is, rests."""
     module = camera(*NOISELESS, "exposures.motion=1.5", "exposures.motion_is=known")
     found, functions = taken(module, texture())
-    still = module.views.point_spread_functions(module.lens, module.variables())
+    still = module.views.point_spread_functions(module.lens.with_values(module.variables()))
     steps = found.motion.norm(dim=1)
     torch.testing.assert_close(steps, torch.tensor([1.5, 0.0, 1.5]).to(steps))
     torch.testing.assert_close(found.motion[0], -found.motion[2])
@@ -143,7 +143,7 @@ def test_motion_is_estimated_of_each_image_by_itself(camera):
     scene = torch.stack([textured(128, 3), textured(128, 4)]).double()
     found, functions = taken(module, scene)
     assert functions.shape == (6, 3, 3, 3, SIZE, SIZE)
-    still = module.views.point_spread_functions(module.lens, module.variables())
+    still = module.views.point_spread_functions(module.lens.with_values(module.variables()))
     moved = (centres(functions) - centres(still))[:, :, 1, 1]  # of each image and readout
     assert float((moved - found.motion.to(moved)).abs().max()) < 0.3
     ignored = camera(*side, "exposures.motion_is=ignored")
@@ -218,7 +218,7 @@ def test_a_bracket_is_applied_to_whole_pictures_at_rest(root, tmp_path):
 
 def test_the_plain_lens_beside_has_all_the_light_that_its_stop_passes(camera):
     module = camera("light=1000")
-    arguments = (module.lens, module.variables(), texture(), "test", 0)
+    arguments = (module.lens.with_values(module.variables()), texture(), "test", 0)
     with torch.no_grad():
         found = module.views.plain_exposure(*arguments)
     # At F/16 a quarter of F/8's, and all the time: 4/3 of the share's noise of a third.

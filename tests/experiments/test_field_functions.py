@@ -85,10 +85,10 @@ def test_an_image_is_its_truth_convolved_with_the_function_of_its_place(
     A pinhole's truth lacks the distortion, of which the function has the shift of the middle only.
     """
     lens, views = doublet(root), views_of(size, truth)
-    taken = views.take(lens, {}, smooth(size + 87), "test", number)
-    functions = views.functions_of_images(lens, {}, taken, "test")
+    taken = views.take(lens, smooth(size + 87), "test", number)
+    functions = views.functions_of_images(lens, taken, "test")
     assert functions.shape == (2, 1, 3, size, size)
-    (of_zone,) = views.point_spread_functions(lens, {})
+    (of_zone,) = views.point_spread_functions(lens)
     inner = slice(size // 2, -(size // 2))
     for view, own in enumerate(functions[:, 0]):
         seen, true = taken.raw[0, view, :, inner, inner], srgb_to_linear(taken.truth[0, view])
@@ -107,9 +107,7 @@ def test_coma_lateral_colour_and_light_are_in_the_function_and_distortion_is_not
 
     def centroids(truth):
         """Rows and columns (2, 3 places, 3 colours) of the light, from the middle; and light."""
-        found = field_functions(
-            lens, {}, PlanarScene((1e5,), LINES), WHOLE, points, truth, 21, "none"
-        )
+        found = field_functions(lens, PlanarScene((1e5,), LINES), WHOLE, points, truth, 21, "none")
         functions = found.functions[:, 0]
         assert torch.allclose(functions.sum((-2, -1)), torch.ones(3, 3), atol=1e-5)
         moments = [(functions * p).sum((-2, -1)) for p in (offset[:, None], offset)]
@@ -151,7 +149,13 @@ def test_functions_are_differentiable_in_the_lens(root, truth, diffraction):
 
     def total(values):
         found = field_functions(
-            lens, values, PlanarScene((1e5,), LINES), WHOLE, points, truth, 41, diffraction
+            lens.with_values(values),
+            PlanarScene((1e5,), LINES),
+            WHOLE,
+            points,
+            truth,
+            41,
+            diffraction,
         )
         return (found.functions * found.light[:, None, :, None, None] * weight).sum()
 
@@ -182,14 +186,14 @@ def test_untrained_restorers_are_told_the_function_of_each_image(camera):
         taken, told = module.take(values, textures, "test", 1)
         assert told is None
         found = restored_by_rivals(module, taken, told, values)["tv"]
-        functions = views.functions_of_images(module.lens, values, taken, "test")
+        functions = views.functions_of_images(module.lens.with_values(values), taken, "test")
         noise = torch.tensor(views.readout.noise)
         restored = [
             rival(raw[None], own, None, noise)
             for raw, own in zip(taken.raw.flatten(0, 1), functions, strict=True)
         ]
         assert torch.allclose(found.flatten(0, 1), torch.cat(restored), atol=1e-6)
-        of_zones = views.point_spread_functions(module.lens, values)
+        of_zones = views.point_spread_functions(module.lens.with_values(values))
         gains = []
         for view in range(1, 5):
             wrong = rival(taken.raw[:, view], of_zones[min(view, 3)][None], None, noise)
@@ -207,13 +211,13 @@ def test_images_of_made_lenses_are_restored_by_their_own_functions(camera):
         settings = AsBuilt(calibration=calibration, lenses_per_step=2)
         manufacture = Manufacture(settings, given, module.lens, module.views)
         with torch.no_grad():
-            lenses = manufacture.for_step(module.lens, values, 0)
+            lenses = manufacture.for_step(module.lens.with_values(values), 0)
             taken, functions = images_of_made_lenses(
                 module, manufacture, lenses, values, batch, None
             )
             for number, made in enumerate(lenses):
                 of = values if calibration == "design" else made.values
-                own = module.views.functions_of_images(module.lens, of, taken, "train")
+                own = module.views.functions_of_images(module.lens.with_values(of), taken, "train")
                 assert torch.allclose(functions[number], own[number : number + 1], atol=2e-5)
         found[calibration] = torch.cat(functions)
     assert (found["design"] - found["own"]).abs().max() > 1e-3

@@ -35,7 +35,7 @@ def camera_of(network, size=(24, 20), functions=None):
     return SimpleNamespace(
         network=network.eval(),
         views=SimpleNamespace(
-            sensor=sensor, readouts=None, point_spread_functions=lambda lens, values: functions
+            sensor=sensor, readouts=None, point_spread_functions=lambda lens: functions
         ),
         lens=None,
         variables=dict,

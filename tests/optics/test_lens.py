@@ -79,6 +79,24 @@ def test_other_values_change_no_state(triplet, axial):
         triplet.system({"surfaces.1.conic": other})
 
 
+def test_a_lens_with_other_values_is_that_lens_everywhere(triplet, axial):
+    curvature = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+    bent = triplet.with_values({"surfaces.1.curvature": curvature})
+    stored = copy.deepcopy(triplet)
+    with torch.no_grad():
+        stored.surfaces["1"].curvature.fill_(0.05)
+    assert torch.equal(bent.trace(axial).position, stored.trace(axial).position)
+    (slope,) = torch.autograd.grad(bent.first_order(550.0).efl, curvature)
+    exact = torch.autograd.grad(stored.first_order(550.0).efl, stored.surfaces["1"].curvature)
+    assert torch.equal(slope, exact[0])
+    # A later value takes the place of one before; the stored ones stay.
+    moved = bent.with_values({"sensor_distance": torch.tensor(40.0, dtype=torch.float64)})
+    assert set(moved.given) == {"surfaces.1.curvature", "sensor_distance"}
+    before = triplet.trace(axial).position
+    assert torch.equal(moved.as_stored().trace(axial).position, before)
+    assert float(triplet.surfaces["1"].curvature) != 0.05
+
+
 def test_gradients_reach_the_values_in_their_place(triplet):
     value = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
     from dolens.optics.paraxial import first_order

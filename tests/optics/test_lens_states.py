@@ -141,6 +141,16 @@ def test_a_heated_state_s_parameters_follow_with_their_derivatives(lens, name):
     assert float(found(start.detach())) == pytest.approx(float(landing(hot)), rel=1e-12)
 
 
+def test_given_values_follow_a_lens_into_its_states(lens):
+    name = "surfaces.1.curvature"
+    value = 1.01 * lens.get_parameter(name).detach()
+    with torch.no_grad():
+        for state in lens.state_names:
+            there = values_there(lens, state, {name: value})
+            found = landing_of(lens.with_values({name: value}).in_state(state), None)
+            assert torch.equal(found, landing_of(lens.in_state(state), there)), state
+
+
 def landing_of(lens, values):
     from dolens.optics.ray_tracing import trace_rays
 

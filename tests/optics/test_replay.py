@@ -54,7 +54,9 @@ def test_the_render_s_replayed_gradient_is_plain_back_propagation(wavefront_codi
         tensors = [dict(lens.named_parameters())[n].clone().requires_grad_() for n in names]
         textures = texture.clone().requires_grad_()
         renderer = RayRenderer(sensor, 4, chunk_rays=300, replay=replayed)
-        image = renderer.render(lens, scene, textures, 5, dict(zip(names, tensors, strict=True)))
+        image = renderer.render(
+            lens.with_values(dict(zip(names, tensors, strict=True))), scene, textures, 5
+        )
         grads = torch.autograd.grad((image * weight).sum(), [textures, *tensors])
         results.append((image.detach(), grads))
     assert torch.equal(results[0][0], results[1][0])
@@ -79,7 +81,7 @@ def test_the_backward_pass_needs_the_memory_of_one_chunk(wavefront_coding):
 
         with torch.autograd.graph.saved_tensors_hooks(count, lambda t: t):
             renderer = RayRenderer(Sensor(size, size, 0.0069), 4, chunk_rays=1024)
-            renderer.render(lens, scene, texture, 1, {"surfaces.5.x3": x3})
+            renderer.render(lens.with_values({"surfaces.5.x3": x3}), scene, texture, 1)
         saved.append(kept)
     assert saved[0] == saved[1] < 2 * texture.numel()
 
@@ -93,7 +95,7 @@ def test_a_fraction_of_the_chunks_estimates_the_gradient_without_bias(wavefront_
     def gradient(fraction, seed):
         x3 = torch.tensor(1.3e-5, dtype=torch.float64, requires_grad=True)
         renderer = RayRenderer(Sensor(8, 8, 0.0069), 3, 9 * 16, gradient_fraction=fraction)
-        image = renderer.render(lens, scene, texture, seed, {"surfaces.5.x3": x3})
+        image = renderer.render(lens.with_values({"surfaces.5.x3": x3}), scene, texture, seed)
         return float(torch.autograd.grad(image.square().sum(), x3)[0])
 
     pairs = [(gradient(0.5, seed), gradient(1.0, seed)) for seed in range(20)]

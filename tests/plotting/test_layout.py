@@ -71,7 +71,7 @@ def test_the_sensor_is_where_and_as_high_as_the_prescription_says():
 
 def test_values_replace_stored_parameters():
     one = load_lens("cooke_triplet")
-    moved = layout_figure(one, values={"sensor_distance": torch.tensor(40.0).double()})
+    moved = layout_figure(one.with_values({"sensor_distance": torch.tensor(40.0).double()}))
     (sensor,) = drawn(moved, "sensor")
     assert sensor[0, 0] == pytest.approx(57.969)
     assert all(path[-1, 0] == pytest.approx(57.969) for path in drawn(moved, "ray"))
@@ -147,7 +147,7 @@ def test_only_glass_is_filled_and_cemented_elements_share_their_interface():
 def test_a_plate_too_flat_to_see_has_its_sag_in_micrometres():
     coefficient = torch.tensor(1.3e-5, dtype=torch.float64)
     values = {"surfaces.5.x3": coefficient, "surfaces.5.y3": 2 * coefficient}
-    figure = layout_figure(load_lens("wavefront_coding"), values=values)
+    figure = layout_figure(load_lens("wavefront_coding").with_values(values))
     assert len(figure.axes) == 2
     for line, factor in zip(figure.axes[1].get_lines(), (1, 2), strict=True):
         t, sag = line.get_data()

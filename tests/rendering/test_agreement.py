@@ -74,7 +74,7 @@ def test_a_plan_says_how_its_gradients_agree(root, caplog):
     }
     auto = AutoRenderer(Sensor(24, 24, 0.06), 2.0, diffraction=False)
     with caplog.at_level(logging.INFO):
-        auto.make_plan(lens, PlanarScene((1e6,), LINES), values)
+        auto.make_plan(lens.with_values(values), PlanarScene((1e6,), LINES))
     numbers = auto.numbers()
     assert numbers["auto/gradient_cosine"] > 0.95
     assert abs(numbers["auto/gradient_norm_ratio"] - 1.0) < 0.15 + numbers["auto/gradient_noise"]

@@ -22,7 +22,7 @@ from dolens.rendering.auto.probes import (
     probe_texture,
     reference,
 )
-from dolens.rendering.auto.trial import with_values
+from dolens.rendering.auto.trial import storing_its_values
 from dolens.rendering.exit_pupil import ExitPupil
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -225,7 +225,7 @@ def test_the_image_and_its_gradient_come_in_the_lens_s_precision(root, dtype):
     auto = AutoRenderer(Sensor(24, 24, 0.0069), 2.0)
     x3 = torch.tensor(1.5e-5, dtype=dtype, requires_grad=True)
     texture = probe_image(56, 56).to(dtype)
-    image = auto.render(lens, scene, texture, 1, {"surfaces.5.x3": x3})
+    image = auto.render(lens.with_values({"surfaces.5.x3": x3}), scene, texture, 1)
     (slope,) = torch.autograd.grad(image.square().sum(), x3)
     assert image.dtype == slope.dtype == dtype
     assert float(slope) != 0.0
@@ -267,11 +267,11 @@ def test_a_plan_is_made_for_the_stop_as_it_is_varied(root):
     lens, scene = coded(root), PlanarScene((6000.0,), LINES)
     radius = torch.tensor(0.5 * lens.surfaces["1"].semi_diameter, dtype=lens.dtype)
     values = {"surfaces.1.semi_diameter": radius, "surfaces.5.x3": torch.zeros_like(radius)}
-    smaller = with_values(lens, values)
+    smaller = storing_its_values(lens.with_values(values))
     assert smaller.surfaces["1"].semi_diameter == float(radius)
     assert lens.surfaces["1"].semi_diameter == pytest.approx(2.0 * float(radius))
     auto = AutoRenderer(Sensor(16, 16, 0.0069), 4.0, gradients=False, diffraction=False)
-    auto.prepare(lens, scene, values)
+    auto.prepare(lens.with_values(values), scene)
     assert auto.choice.error < 4.0
 
 

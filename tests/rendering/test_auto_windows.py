@@ -117,7 +117,7 @@ def test_a_choice_that_still_serves_is_kept_and_another_lens_gets_another(double
     assert windows.choice.renderer == before
     # Half a millimetre out of focus: wider functions.
     defocused = {"sensor_distance": doublet.sensor_distance + 1.5}
-    windows.prepare(doublet, SCENE, defocused)
+    windows.prepare(doublet.with_values(defocused), SCENE)
     assert windows.plans == 2
     assert windows.choice.renderer.size > before.size
     assert windows.choice.error <= 1.0

@@ -232,9 +232,8 @@ def test_second_derivatives_are_an_error(wavefront_coding):
     lens = wavefront_coding(1e-5)
     lens.backend = "cpu"
     x3 = torch.tensor(1e-5, dtype=torch.float64, requires_grad=True)
-    image = RayRenderer(SMALL, 2).render(
-        lens, PlanarScene([8000.0], LINES), texture(40), 0, {"surfaces.5.x3": x3}
-    )
+    coded = lens.with_values({"surfaces.5.x3": x3})
+    image = RayRenderer(SMALL, 2).render(coded, PlanarScene([8000.0], LINES), texture(40), 0)
     (gradient,) = torch.autograd.grad(image.square().sum(), x3, create_graph=True)
     with pytest.raises(InputError, match="first derivatives only"):
         torch.autograd.grad(gradient, x3)

@@ -38,7 +38,11 @@ def squared_error(lens, renderer, depth, texture_scale="magnification"):
     truth = pinhole_image(textures, sensor)[:, None]
 
     def loss(values, seed):
-        return (renderer.render(lens, scene, textures, seed, values) - truth).square().mean()
+        return (
+            (renderer.render(lens.with_values(values), scene, textures, seed) - truth)
+            .square()
+            .mean()
+        )
 
     return loss
 
@@ -87,7 +91,10 @@ def test_the_bias_of_a_squared_error_falls_with_the_rays(root):
     truth = pinhole_image(textures, sensor)[:, None]
 
     def errors(rays, seed, value):
-        return RayRenderer(sensor, rays).render(lens, scene, textures, seed, {name: value}) - truth
+        return (
+            RayRenderer(sensor, rays).render(lens.with_values({name: value}), scene, textures, seed)
+            - truth
+        )
 
     def slope(rays, seed, other=None):
         value = start.clone().requires_grad_()
@@ -137,7 +144,9 @@ def test_white_corners_darken_by_the_derivative(root):
 
     def loss(values, seed):
         renderer = RayRenderer(sensor, 64)
-        return (renderer.render(lens, scene, white, seed, values)[0, 0, 0] * corner).sum()
+        return (
+            renderer.render(lens.with_values(values), scene, white, seed)[0, 0, 0] * corner
+        ).sum()
 
     # A wider stop lets more light through on the axis, which the corner is measured by.
     names = ["surfaces.3.semi_diameter", "surfaces.4.semi_diameter", "sensor_distance"]

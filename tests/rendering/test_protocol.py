@@ -33,7 +33,7 @@ class PinholeRenderer(Renderer):
     sensor: Sensor
     gain: float = 1.0
 
-    def render(self, lens, scene, textures, seed, values=None):
+    def render(self, lens, scene, textures, seed):
         image = self.gain * pinhole_image(textures, self.sensor, scene.texture_centre)
         return image[:, None].expand(-1, len(scene.depths), -1, -1, -1)
 
@@ -71,10 +71,10 @@ def test_a_large_field_is_seen_through_it(root):
     lens = load_lens(root / "conf/lens/large_fov_doublet.yaml", dtype=torch.float32)
     scene = PlanarScene((1e5,), LINES)
     views = FieldViews(scene, WHOLE, PinholeRenderer(WINDOW), Readout(), truth="pinhole")
-    views.prepare(lens, {})
-    taken = views.take(lens, {}, textures(), "test", 0)
+    views.prepare(lens)
+    taken = views.take(lens, textures(), "test", 0)
     assert torch.allclose(taken.raw, srgb_to_linear(taken.truth), atol=1e-6)
-    assert views.take(lens, {}, textures(), "train", 0).raw.shape == (2, 1, 3, 16, 20)
+    assert views.take(lens, textures(), "train", 0).raw.shape == (2, 1, 3, 16, 20)
     assert views.rays() == 0
 
 

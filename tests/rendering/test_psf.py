@@ -86,7 +86,9 @@ def test_the_gradient_with_respect_to_the_plate_is_its_derivative(wavefront_codi
     weight = torch.randn(33, 33, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def value(x3):
-        psf = axial_point_spread_functions(lens, scene, SENSOR, 33, 24, {"surfaces.5.x3": x3})
+        psf = axial_point_spread_functions(
+            lens.with_values({"surfaces.5.x3": x3}), scene, SENSOR, 33, 24
+        )
         return (psf[0, 0] * weight).sum()
 
     x3 = torch.tensor(1.0e-5, dtype=torch.float64, requires_grad=True)

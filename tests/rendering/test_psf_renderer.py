@@ -104,7 +104,7 @@ def test_gradients_of_the_plate_are_those_of_rays(root):
     def gradient(renderer, seed):
         plate = torch.tensor([1.5e-5, 1e-6, -1e-6, 1.2e-5]).double().requires_grad_()
         values = {f"surfaces.5.{n}": plate[i] for i, n in enumerate(("x3", "x2y", "xy2", "y3"))}
-        image = renderer.render(lens, scene, textures, seed, values)
+        image = renderer.render(lens.with_values(values), scene, textures, seed)
         return torch.autograd.grad((image * weight).sum(), plate)[0]
 
     rays = gradient(RayRenderer(sensor, 16), 0)
@@ -124,7 +124,9 @@ def test_gradients_are_finite_differences(root, fields, registration):
     weight = texture(20)[:, None, :, :16] - 0.5
 
     def value(x3):
-        return (renderer.render(lens, scene, textures, 4, {"surfaces.5.x3": x3}) * weight).sum()
+        return (
+            renderer.render(lens.with_values({"surfaces.5.x3": x3}), scene, textures, 4) * weight
+        ).sum()
 
     x3 = torch.tensor(1.3e-5, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(value(x3), x3)
@@ -298,7 +300,9 @@ def test_gradients_through_waves_are_finite_differences(root):
     weight = texture(12)[:, None, :1] - 0.5
 
     def value(x3):
-        return (renderer.render(lens, scene, textures, 4, {"surfaces.5.x3": x3}) * weight).sum()
+        return (
+            renderer.render(lens.with_values({"surfaces.5.x3": x3}), scene, textures, 4) * weight
+        ).sum()
 
     x3 = torch.tensor(1.3e-5, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(value(x3), x3)

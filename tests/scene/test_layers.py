@@ -126,7 +126,7 @@ def test_between_planes_the_error_falls_with_the_square_of_their_distance(triple
         renderer = PsfRenderer(sensor, (1, 1), 48, 41, jitter=False)
     colours = 0.5 + 0.15 * noise(64)
     depth = 1900.0
-    plane = renderer.render(triplet, PlanarScene((depth,), GREEN), colours, 1, focus)
+    plane = renderer.render(triplet.with_values(focus), PlanarScene((depth,), GREEN), colours, 1)
     errors = []
     for gap in (8.0, 4.0, 2.0):
         # Neighbours at 0.3 and 0.7 of a gap of so many pixels of blur's radius.
@@ -134,7 +134,7 @@ def test_between_planes_the_error_falls_with_the_square_of_their_distance(triple
         around = [1.0 / depth - 0.3 * gap * per_pixel, 1.0 / depth + 0.7 * gap * per_pixel]
         scene = LayeredScene(sorted(1.0 / v for v in around), GREEN)
         textures = torch.cat((colours, torch.full_like(colours, depth)), 1)
-        image = renderer.render(triplet, scene, textures, 1, focus)
+        image = renderer.render(triplet.with_values(focus), scene, textures, 1)
         errors.append(rms(image - plane) / GREY)
     assert errors[2] < 1.5
     assert errors[0] > 2.5 * errors[1] > 2.5**2 * errors[2]
@@ -150,8 +150,8 @@ def test_white_is_white_at_any_depths(triplet, renderer, reach):
     white = torch.ones(1, 1, 60, 60, dtype=torch.float64)
     focus = focused(triplet, FAR)
     scene = LayeredScene.evenly_spaced(NEAR, FAR, 5, GREEN, inpainting_radius=reach)
-    image = renderer.render(triplet, scene, torch.cat((white, depths), 1), 2, focus)
-    plane = renderer.render(triplet, PlanarScene((2000.0,), GREEN), white, 2, focus)
+    image = renderer.render(triplet.with_values(focus), scene, torch.cat((white, depths), 1), 2)
+    plane = renderer.render(triplet.with_values(focus), PlanarScene((2000.0,), GREEN), white, 2)
     assert float((image - plane).abs().max()) < 1e-4
 
 
@@ -221,7 +221,7 @@ def test_an_edge_in_front_of_an_edge_is_that_of_a_thin_lens(
     renderer = RayRenderer(sensor, 24)
     if kind == "psf":
         renderer = PsfRenderer(sensor, (1, 1), 48, 31, jitter=False)
-    image = renderer.render(triplet, scene, textures, 1, focused(triplet, focus))
+    image = renderer.render(triplet.with_values(focused(triplet, focus)), scene, textures, 1)
     found = image[0, 0, 0].mean(0)
     assert rms(found - torch.from_numpy(expected)) < tolerance * GREY
 
@@ -251,7 +251,7 @@ def test_a_steep_slope_is_displaced_by_less_than_a_third_of_a_pixel(triplet, kin
     renderer = RayRenderer(sensor, 24, pixel_area=False)
     if kind == "psf":
         renderer = PsfRenderer(sensor, (1, 1), 48, 31, jitter=False)
-    image = renderer.render(triplet, scene, textures, 1, focused(triplet, focus))
+    image = renderer.render(triplet.with_values(focused(triplet, focus)), scene, textures, 1)
     pixel = column[20:36]
     slope = (far - near) / (size - 1)
     mean = 2.0 * (1.0 - math.sqrt(1.0 - slope**2)) / slope**2

@@ -51,13 +51,13 @@ def test_a_made_lens_is_as_far_from_its_best_focus_as_the_design(triplet, target
     tolerances = tolerances_from(triplet, {"surfaces.*.curvature": 1e-4, "thicknesses.2": 0.05})
     design = {"sensor_distance": triplet.sensor_distance.detach() + 0.3}
     (errors,) = tolerances.draw(1, torch.Generator().manual_seed(1))
-    made = assembled(triplet, design, tolerances, errors, target)
+    made = assembled(triplet.with_values(design), tolerances, errors, target)
     of_design = best_focus(triplet.system(design), target)
     of_made = best_focus(triplet.system(made), target)
     assert float(of_design) == pytest.approx(-0.3, abs=0.1)
     torch.testing.assert_close(of_made, of_design, rtol=1e-9, atol=1e-10)
     # Without an assembly line the sensor stays where it is.
-    unfocused = assembled(triplet, design, tolerances, errors, None)
+    unfocused = assembled(triplet.with_values(design), tolerances, errors, None)
     assert unfocused["sensor_distance"] is design["sensor_distance"]
     assert abs(float(best_focus(triplet.system(unfocused), target) - of_design)) > 0.01
 
@@ -66,7 +66,7 @@ def test_an_error_of_the_sensor_is_what_focusing_leaves_over(triplet, target):
     tolerances = tolerances_from(triplet, {"surfaces.1.curvature": 1e-4, "sensor_distance": 0.05})
     drawn = {"surfaces.1.curvature": 8e-5, "sensor_distance": 0.03}
     errors = torch.tensor([drawn[name] for name in tolerances.names], dtype=torch.float64)
-    made = assembled(triplet, {}, tolerances, errors, target)
+    made = assembled(triplet, tolerances, errors, target)
     with_both = best_focus(triplet.system(made), target)
     nominal = best_focus(triplet.system(), target)
     torch.testing.assert_close(with_both, nominal - 0.03, rtol=0.0, atol=1e-9)
@@ -78,7 +78,7 @@ def test_the_parameters_of_a_made_lens_are_differentiable_in_the_design(triplet,
 
     def sensor(curvature):
         values = {"surfaces.3.curvature": curvature}
-        return assembled(triplet, values, tolerances, errors, target)["sensor_distance"]
+        return assembled(triplet.with_values(values), tolerances, errors, target)["sensor_distance"]
 
     at = triplet.surfaces["3"].curvature.detach().clone().requires_grad_(True)
     (slope,) = torch.autograd.grad(sensor(at), at)
@@ -92,7 +92,7 @@ def test_the_expected_spread_is_what_drawn_lenses_show(triplet, target):
     spots = gaussian_quadrature(triplet, [(0.0, 0.0), (0.0, 14.0)], LINES[:1], 3, 6, symmetry=False)
     given = {"elements.*.tilt_[xy]": 0.02, "surfaces.*.curvature": 2e-5, "thicknesses.2": 0.01}
     tolerances = tolerances_from(triplet, given)
-    expected = expected_spread(triplet, {}, tolerances, spots, target)
+    expected = expected_spread(triplet, tolerances, spots, target)
     ray = Components(*spots.rays.components())
 
     def centred(values):
@@ -107,7 +107,7 @@ def test_the_expected_spread_is_what_drawn_lenses_show(triplet, target):
     moved = [
         (
             spots.weight[:, None]
-            * (centred(assembled(triplet, {}, tolerances, row, target)) - nominal).square()
+            * (centred(assembled(triplet, tolerances, row, target)) - nominal).square()
         ).sum()
         / spots.count
         for row in errors
@@ -121,9 +121,8 @@ def test_the_expected_spread_is_differentiable_in_the_design(triplet, target):
     tolerances = tolerances_from(triplet, {"elements.*.tilt_x": 0.05, "thicknesses.2": 0.02})
 
     def spread(curvature):
-        return expected_spread(
-            triplet, {"surfaces.3.curvature": curvature}, tolerances, spots, target
-        )
+        bent = triplet.with_values({"surfaces.3.curvature": curvature})
+        return expected_spread(bent, tolerances, spots, target)
 
     at = triplet.surfaces["3"].curvature.detach().clone().requires_grad_(True)
     (slope,) = torch.autograd.grad(spread(at), at)
@@ -143,13 +142,13 @@ def test_a_lens_of_another_index_is_focused_where_its_glass_has_the_focus(triple
         triplet, {"media.*.index_offset": 1e-3, "surfaces.*.astigmatism_0": 5e-4}
     )
     (errors,) = tolerances.draw(1, torch.Generator().manual_seed(4))
-    made = assembled(triplet, {}, tolerances, errors, target)
+    made = assembled(triplet, tolerances, errors, target)
     assert set(made) == {*tolerances.names, "sensor_distance"}
     of_made = best_focus(triplet.system(made), target)
     torch.testing.assert_close(of_made, best_focus(triplet.system(), target), rtol=0.0, atol=1e-9)
 
     def sensor(at):
-        return assembled(triplet, {}, tolerances, at, target)["sensor_distance"]
+        return assembled(triplet, tolerances, at, target)["sensor_distance"]
 
     start = errors.clone().requires_grad_()
     (found,) = torch.autograd.grad(sensor(start), start)

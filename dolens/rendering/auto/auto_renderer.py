@@ -16,8 +16,8 @@ from dolens.optics.lens import Lens
 from dolens.rendering.auto.choice import Choice, Tolerances, choose, measured
 from dolens.rendering.auto.field_grid import REGISTRATIONS
 from dolens.rendering.auto.plan import Requirements
-from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
-from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values, WindowShare
+from dolens.rendering.auto.trial import ProbeSet, Trial
+from dolens.rendering.protocol import Measure, Renderer, SensorWindow, WindowShare
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 from dolens.tasks import stage
@@ -107,15 +107,14 @@ class AutoRenderer(Renderer):
         scene: Scene,
         textures: Tensor,
         seed: int,
-        values: Values | None = None,
     ) -> Tensor:
         """Image textures as a scene shows them; see `Renderer.render`.
 
         The image is in the lens's precision, whatever the plan's is.
         """
-        choice = self._choice(lens, scene, values)
-        planned, values = self._as_planned(lens, choice.dtype, values)
-        image = choice.renderer.render(planned, scene, textures, seed, values)
+        choice = self._choice(lens, scene)
+        planned = self._as_planned(lens, choice.dtype)
+        image = choice.renderer.render(planned, scene, textures, seed)
         return image.to(lens.dtype)
 
     def render_windows(
@@ -125,12 +124,11 @@ class AutoRenderer(Renderer):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Values | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own; see `Renderer.render_windows`."""
-        choice = self._choice(lens, scene, values)
-        planned, values = self._as_planned(lens, choice.dtype, values)
-        image = choice.renderer.render_windows(planned, scene, textures, windows, seed, values)
+        choice = self._choice(lens, scene)
+        planned = self._as_planned(lens, choice.dtype)
+        image = choice.renderer.render_windows(planned, scene, textures, windows, seed)
         return image.to(lens.dtype)
 
     def render_share(
@@ -140,35 +138,31 @@ class AutoRenderer(Renderer):
         textures: Tensor,
         windows: Sequence[SensorWindow],
         seed: int,
-        values: Values | None,
         share: WindowShare,
     ) -> Tensor:
         """Image each texture on its window, one of a larger batch; see `Renderer.render_share`."""
-        choice = self._choice(lens, scene, values)
-        planned, values = self._as_planned(lens, choice.dtype, values)
-        image = choice.renderer.render_share(planned, scene, textures, windows, seed, values, share)
+        choice = self._choice(lens, scene)
+        planned = self._as_planned(lens, choice.dtype)
+        image = choice.renderer.render_share(planned, scene, textures, windows, seed, share)
         return image.to(lens.dtype)
 
-    def _choice(self, lens: Lens, scene: Scene, values: Values | None) -> Choice:
+    def _choice(self, lens: Lens, scene: Scene) -> Choice:
         """Return the choice; make a plan where there is none."""
-        return self.choice or self.make_plan(lens, scene, values)
+        return self.choice or self.make_plan(lens, scene)
 
-    def _as_planned(
-        self, lens: Lens, dtype: torch.dtype, values: Values | None
-    ) -> tuple[Lens, Values | None]:
-        """The lens and values in the plan's precision; gradients flow back to the lens's own."""
+    def _as_planned(self, lens: Lens, dtype: torch.dtype) -> Lens:
+        """The lens in the plan's precision; gradients flow back to its own values."""
         if dtype == lens.dtype:
-            return lens, values
-        values = {**dict(lens.named_parameters()), **(values or {})}
+            return lens
+        values = {**dict(lens.named_parameters()), **lens.given}
         assert self._cast is not None  # the choice was made with it
-        return self._cast, {name: value.to(dtype) for name, value in values.items()}
+        return self._cast.with_values({name: value.to(dtype) for name, value in values.items()})
 
     @torch.no_grad()
     def prepare(
         self,
         lens: Lens,
         scene: Scene,
-        values: Values | None = None,
         measure: Measure | None = None,
         photographs: Tensor | None = None,
     ) -> None:
@@ -178,19 +172,18 @@ class AutoRenderer(Renderer):
         Args:
             lens: as of `render`, and the scene.
             scene: planes and wavelengths.
-            values: parameters of the lens as it is now.
             measure: the variables and the loss whose gradients are to be those of rays; None: for a
-                whole sensor the squared error to the truth, with respect to those values that
-                require gradients, and for windows none.
+                whole sensor the squared error to the truth, with respect to those values that the
+                lens was given and that require gradients, and for windows none.
             photographs: (P, 3, h, w), linear light: what the scene may look like, beside the two
                 probe images; those of a later call replace them.
         """
         if photographs is not None:
             self._photographs = photographs
         started, before = time.perf_counter(), self.choice
-        trial = self._trial(lens, scene, values, measure)
+        trial = self._trial(lens, scene, measure)
         if before is not None:
-            renewed = before.renderer.with_pupil(lens, scene, values)
+            renewed = before.renderer.with_pupil(lens, scene)
             # The whole sensor is measured with the pupil that it was rendered with until now.
             renderer = renewed if self.windows else before.renderer
             with stage("checking the renderer's plan"):
@@ -214,7 +207,7 @@ class AutoRenderer(Renderer):
         self._cast = trial.lens(chosen.dtype).requires_grad_(False)
         self.choice = replace(
             chosen,
-            renderer=chosen.renderer.with_pupil(lens, scene, values),
+            renderer=chosen.renderer.with_pupil(lens, scene),
             seconds=time.perf_counter() - started,
         )
         for line in self.choice.lines():
@@ -222,17 +215,14 @@ class AutoRenderer(Renderer):
         for line in self.tolerances.misses(self.choice):
             logger.warning("renderer auto: %s", line)
 
-    def _trial(
-        self, lens: Lens, scene: Scene, values: Values | None, measure: Measure | None
-    ) -> Trial:
+    def _trial(self, lens: Lens, scene: Scene, measure: Measure | None) -> Trial:
         """The lens as it is, before the probe images."""
         registrations = ("chief_rays",) if self.windows else REGISTRATIONS
         return Trial(
-            with_values(lens, values),
+            lens,
             scene,
             ProbeSet(self.sensor, self.seed, self.windows, self._photographs),
             Requirements(self.tolerance, self.gradients, self.diffraction, registrations),
-            values if self.gradients else None,
             measure if self.gradients else None,
         )
 
@@ -241,12 +231,11 @@ class AutoRenderer(Renderer):
         self,
         lens: Lens,
         scene: Scene,
-        values: Values | None = None,
         measure: Measure | None = None,
     ) -> Choice:
         """Choose, measure on the probe images, log; the choice is kept for `render`."""
         self.choice = None
-        self.prepare(lens, scene, values, measure)
+        self.prepare(lens, scene, measure)
         found: Choice | None = self.choice
         assert found is not None  # `prepare` chose
         return found

@@ -62,9 +62,8 @@ class Trial:
         scene: what it looks at; the probe images stand in its planes.
         probes: the sensor, its windows and the images.
         requirements: the conditions that plans keep to.
-        values: the lens's parameters by name; where nothing else is said, gradients of the whole
-            sensor's image are of those that require them.
-        measure: of gradients; None: `image_measure` of the values.
+        measure: of gradients; None: where they matter, of the whole sensor's image with respect to
+            those of the lens's given values that require them, `image_measure`.
     """
 
     def __init__(
@@ -73,11 +72,12 @@ class Trial:
         scene: Scene,
         probes: ProbeSet,
         requirements: Requirements,
-        values: Values | None = None,
         measure: Measure | None = None,
     ) -> None:
         self.probes, self.requirements = probes, requirements
         self.scene, self.separate_planes = as_planes(scene), scene.separate_planes
+        values = lens.given if requirements.gradients else {}
+        lens = storing_its_values(lens)
         self._single, self._double = (
             copy.deepcopy(lens).to(dtype) for dtype in (torch.float32, torch.float64)
         )
@@ -95,7 +95,7 @@ class Trial:
         self._measure = None
         if measure is not None:
             self._measure = measure(self._each)
-        elif not probes.windows and values and any(v.requires_grad for v in values.values()):
+        elif not probes.windows and any(v.requires_grad for v in values.values()):
             (window,), (textures,) = self.windows, self._textures
             truth = pinhole_image(textures, window.sensor, window.texture_centre)[:, None]
             self._measure = image_measure(values, truth)
@@ -202,9 +202,12 @@ class Trial:
         def render(values: Values, seed: int) -> Tensor:
             cast = {name: value.to(dtype) for name, value in values.items()}
             if self.probes.windows:
-                return renderer.render_windows(lens, self.scene, textures, self._each, seed, cast)
+                each = self._each
+                return renderer.render_windows(
+                    lens.with_values(cast), self.scene, textures, each, seed
+                )
             placed = self._placed(self.windows[0])
-            return renderer.render(lens, placed, textures, seed, cast)
+            return renderer.render(lens.with_values(cast), placed, textures, seed)
 
         return render
 
@@ -213,11 +216,11 @@ class Trial:
         return replace(self.scene, texture_centre=window.texture_centre)
 
 
-def with_values(lens: Lens, values: Values | None) -> Lens:
-    """The lens with some parameters, and semi-diameters, replaced as `Lens.system` does."""
-    changed = copy.deepcopy(lens)
+def storing_its_values(lens: Lens) -> Lens:
+    """Return a copy of a lens that stores the values that it was given, semi-diameters too."""
+    changed = copy.deepcopy(lens.as_stored())
     parameters = dict(changed.named_parameters())
-    for name, value in (values or {}).items():
+    for name, value in lens.given.items():
         if name in parameters:
             parameters[name].copy_(value)
             continue

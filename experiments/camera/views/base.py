@@ -153,7 +153,6 @@ class Imaging(ABC):
     def take(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -171,7 +170,6 @@ class Imaging(ABC):
     def point_spread_functions(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
         size: int | None = None,
@@ -181,9 +179,7 @@ class Imaging(ABC):
         K is the views' own number of pixels, or the odd one that is given as `size`.
         """
 
-    def functions_of_images(
-        self, lens: Lens, values: Mapping[str, Tensor], taken: Views, stage: str
-    ) -> Tensor | None:
+    def functions_of_images(self, lens: Lens, taken: Views, stage: str) -> Tensor | None:
         """Return the point spread functions of each image's own place, (B·V, D, 3, K, K).
 
         I(p) = Σ PSF(e) · S(p - e) in the sensor's pixels, with S the truth in linear light.  Their
@@ -191,7 +187,6 @@ class Imaging(ABC):
 
         Args:
             lens: the lens.
-            values: its variables.
             taken: the images.
             stage: that they were taken in, whose renderer says how diffraction is modelled.
 
@@ -212,9 +207,7 @@ class Imaging(ABC):
         """
         return [1.0 / fields] * fields
 
-    def whole_picture(
-        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
-    ) -> WholePicture:
+    def whole_picture(self, lens: Lens, picture: Tensor, placing: Placing) -> WholePicture:
         """Image a picture (3, h, w) of any size, linear light, as a plane at one depth.
 
         Raises:
@@ -225,7 +218,6 @@ class Imaging(ABC):
     def by_place(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         size: tuple[int, int],
         placing: Placing | None = None,
     ) -> ByPlace | None:
@@ -233,7 +225,6 @@ class Imaging(ABC):
 
         Args:
             lens: the lens.
-            values: its variables.
             size: height and width of the picture on the sensor, pixels.
             placing: how it was put in front of the camera; None: as in training.
         """
@@ -281,7 +272,6 @@ class Imaging(ABC):
     def prepare(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         comparison: Comparison | None = None,
         photographs: Tensor | None = None,
     ) -> None:
@@ -289,14 +279,13 @@ class Imaging(ABC):
 
         Args:
             lens: the lens.
-            values: its variables.
             comparison: which gradients a renderer that chooses its model has to get right.
             photographs: (P, 3, h, w), linear light, on which it has to, beside its own images.
         """
         measure = None if comparison is None else self._measure(lens, comparison)
-        self._training.prepare(lens, self.scene, values, measure, photographs)
+        self._training.prepare(lens, self.scene, measure, photographs)
         if self.keeps_pupil:
-            self._training = self._training.with_pupil(lens, self.scene, values)
+            self._training = self._training.with_pupil(lens, self.scene)
 
     def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
         """The training's loss as a function of images of textures; None where there is none."""
@@ -317,7 +306,6 @@ class Imaging(ABC):
     def plain_exposure(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,

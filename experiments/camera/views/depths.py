@@ -146,7 +146,7 @@ class DepthViews(Imaging):
 
         def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
             raw = self._raw(image.to(lens.dtype), self.seed)
-            truth = self._truth(lens, values, textures.to(raw)).expand_as(raw)
+            truth = self._truth(lens.with_values(values), textures.to(raw)).expand_as(raw)
             return comparison.loss(Views(truth, raw), values)
 
         found = GradientMeasure(comparison.variables, comparison.values, loss)
@@ -155,7 +155,6 @@ class DepthViews(Imaging):
     def take(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -166,18 +165,16 @@ class DepthViews(Imaging):
         renderer = self._training if stage == "train" else self.evaluation_renderer
         renderer = renderer if reference is None else self._reference_renderers[reference]
         seed = seed_of(self.seed, stage, index)
-        image = renderer.render(lens, self.scene, textures, seed, values)
+        image = renderer.render(lens, self.scene, textures, seed)
         raw = self._raw(image, seed, share)
-        return Views(self._truth(lens, values, textures).expand_as(raw), raw)
+        return Views(self._truth(lens, textures).expand_as(raw), raw)
 
-    def _truth(self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor) -> Tensor:
+    def _truth(self, lens: Lens, textures: Tensor) -> Tensor:
         """(B, D or 1, 3, H, W), display-encoded."""
         colours = self.scene.colours(textures)
         if self.truth == "pinhole":
             return linear_to_srgb(pinhole_image(colours, self.sensor))[:, None]
-        ((rows, columns),) = reference_chief_ray_map(
-            lens, values, self.scene, self.sensor, [self.sensor]
-        )
+        ((rows, columns),) = reference_chief_ray_map(lens, self.scene, self.sensor, [self.sensor])
         centre = self.scene.texture_centre
         planes = [sample_texture(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
         return linear_to_srgb(torch.stack(planes, 1))
@@ -189,7 +186,6 @@ class DepthViews(Imaging):
     def point_spread_functions(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
         size: int | None = None,
@@ -203,20 +199,17 @@ class DepthViews(Imaging):
             self.sensor,
             size or self.psf_size,
             samples,
-            values,
             # As they are in the images, whose truth is where their chief rays are.
             centred=self.registers_moved_images,
         )
         if self.psf_diffraction == "none":
             return functions
-        f_number = self._f_number or axial_f_number(lens)
+        f_number = self._f_number or axial_f_number(lens.as_stored())
         pitch = self.sensor.pixel_pitch
         return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
 
     @torch.no_grad()
-    def whole_picture(
-        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
-    ) -> WholePicture:
+    def whole_picture(self, lens: Lens, picture: Tensor, placing: Placing) -> WholePicture:
         """Image a picture with the blur on the axis everywhere: the camera's sensor is a small part
         of the field, and a larger picture stands for many such parts side by side.
         """
@@ -225,7 +218,7 @@ class DepthViews(Imaging):
         picture = resized(picture, *size).to(lens.device)
         scene = at_depth(as_planes(self.scene), placing.depth, lens)
         diffraction = placing.diffraction or diffraction_of(self.evaluation_renderer)
-        functions = axial_function(lens, values, scene, self.sensor, self.psf_size, diffraction)
+        functions = axial_function(lens, scene, self.sensor, self.psf_size, diffraction)
         mapping = (
             f"{scale:g} pixel(s) of the picture to one of the sensor, {size[1]}×{size[0]} of "
             f"{1000.0 * self.sensor.pixel_pitch:g} µm; the blur on the axis everywhere, in "
@@ -280,7 +273,6 @@ class LayerViews(DepthViews):
     def take(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -293,7 +285,7 @@ class LayerViews(DepthViews):
             near, far = self.scene.depths[0], self.scene.depths[-1]
             before = 0 if share is None else share.first
             textures = with_occluders(textures, near, far, self.occluders, generator, before)
-        return super().take(lens, values, textures, stage, index, reference, share)
+        return super().take(lens, textures, stage, index, reference, share)
 
 
 def with_occluders(

@@ -21,7 +21,7 @@ from dolens.experiments.camera.views.base import (
 from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.experiments.settings import check_positive
 from dolens.optics.lens import Lens
-from dolens.optics.lens_states import check_state, values_there
+from dolens.optics.lens_states import check_state
 from dolens.reconstruction.likelihood import estimated_motion
 from dolens.reconstruction.wiener import shifted
 from dolens.sensor.noise import BatchShare, generator_of
@@ -131,12 +131,10 @@ class ExposedViews(Imaging):
     def _first(self) -> Imaging:
         return next(iter(self.parts.values()))
 
-    def _states(
-        self, lens: Lens, values: Mapping[str, Tensor]
-    ) -> Iterator[tuple[Imaging, Lens, Mapping[str, Tensor]]]:
-        """Yield the views of each state, the lens in it, and its values there."""
+    def _states(self, lens: Lens) -> Iterator[tuple[Imaging, Lens]]:
+        """Yield the views of each state, and the lens in it."""
         for name, part in self.parts.items():
-            yield part, lens.in_state(name), values_there(lens, name, values)
+            yield part, lens.in_state(name)
 
     @property
     def image_sensor(self) -> Sensor:
@@ -175,7 +173,6 @@ class ExposedViews(Imaging):
     def take(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -186,9 +183,9 @@ class ExposedViews(Imaging):
         motion = self._motion(stage, index).to(textures)
         told = (reference,) if share is None else (reference, share)
         found = []
-        for moved, (part, *state) in zip(motion, self._states(lens, values), strict=True):
-            there = shifted(textures, moved) if bool(moved.any()) else textures
-            found.append(part.take(*state, there, stage, index, *told))
+        for moved, (part, there) in zip(motion, self._states(lens), strict=True):
+            shown = shifted(textures, moved) if bool(moved.any()) else textures
+            found.append(part.take(there, shown, stage, index, *told))
         middle = found[len(found) // 2]  # which does not move
         shares = list(self.shares.values())
         seed = seed_of(self.seed, stage, index)
@@ -218,7 +215,6 @@ class ExposedViews(Imaging):
     def point_spread_functions(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
         size: int | None = None,
@@ -228,17 +224,12 @@ class ExposedViews(Imaging):
         Otherwise as `Imaging.point_spread_functions`.
         """
         asked = (pupil_samples, depths, size)
-        return self._joined(self._of_states(lens, values, *asked), None)
+        return self._joined(self._of_states(lens, *asked), None)
 
-    def _of_states(self, lens: Lens, values: Mapping[str, Tensor], *asked: Any) -> Sequence[Tensor]:
-        return [
-            part.point_spread_functions(*state, *asked)
-            for part, *state in self._states(lens, values)
-        ]
+    def _of_states(self, lens: Lens, *asked: Any) -> Sequence[Tensor]:
+        return [part.point_spread_functions(there, *asked) for part, there in self._states(lens)]
 
-    def functions_of_images(
-        self, lens: Lens, values: Mapping[str, Tensor], taken: Views, stage: str
-    ) -> Tensor | None:
+    def functions_of_images(self, lens: Lens, taken: Views, stage: str) -> Tensor | None:
         """Return what restorers are told of images: with the motion as it is known, and where the
         views know their places, of those.
 
@@ -247,14 +238,13 @@ class ExposedViews(Imaging):
             where functions are the same for all images, and the scene rests.
         """
         places = [
-            part.functions_of_images(*state, taken, stage)
-            for part, *state in self._states(lens, values)
+            part.functions_of_images(there, taken, stage) for part, there in self._states(lens)
         ]
         own = [functions for functions in places if functions is not None]
         known = self.settings.motion_is if self.settings.motion else "ignored"
         if known == "ignored" and not own:
             return None
-        states, dim = (own, 1) if own else (self._of_states(lens, values), 0)
+        states, dim = (own, 1) if own else (self._of_states(lens), 0)
         if known == "known":
             return self._joined(states, taken.motion, dim)
         still = self._joined(states, None, dim)
@@ -287,7 +277,6 @@ class ExposedViews(Imaging):
     def plain_exposure(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -296,15 +285,12 @@ class ExposedViews(Imaging):
         """Return images of the scene at rest by the state `beside`."""
         if not self.has_plain_exposure:
             return None
-        name = self.settings.beside
-        state = lens.in_state(name), values_there(lens, name, values)
-        taken = self._plain.take(*state, textures, stage, index, reference)
-        functions = self._plain.point_spread_functions(*state)
+        there = lens.in_state(self.settings.beside)
+        taken = self._plain.take(there, textures, stage, index, reference)
+        functions = self._plain.point_spread_functions(there)
         return PlainExposure(taken, functions, self._plain.readout.noise)
 
-    def whole_picture(
-        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
-    ) -> WholePicture:
+    def whole_picture(self, lens: Lens, picture: Tensor, placing: Placing) -> WholePicture:
         """Image a picture at rest in every state; see `Imaging.whole_picture`.
 
         Raises:
@@ -312,10 +298,7 @@ class ExposedViews(Imaging):
         """
         if self.view_is_known:
             raise InputError("exposures: whole pictures of a field; allowed: exposures=null")
-        found = [
-            part.whole_picture(*state, picture, placing)
-            for part, *state in self._states(lens, values)
-        ]
+        found = [part.whole_picture(there, picture, placing) for part, there in self._states(lens)]
         images = torch.stack([one.image for one in found], dim=1)
         weights = images.new_tensor(list(self.shares.values()))
         swept = torch.einsum("n,bnchw->bchw", weights, images)
@@ -371,13 +354,12 @@ class ExposedViews(Imaging):
     def prepare(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         comparison: Comparison | None = None,
         photographs: Tensor | None = None,
     ) -> None:
         """Let the training renderer look at the lens in each state, by the images alone."""
-        for part, *state in self._states(lens, values):
-            part.prepare(*state, None, photographs)
+        for part, there in self._states(lens):
+            part.prepare(there, None, photographs)
 
     def rays(self) -> int:
         """Rays that a training image takes, in all states; 0 before a renderer is chosen."""

@@ -1,7 +1,6 @@
 """Windows on a large sensor: their places, and the point spread functions there."""
 
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -125,16 +124,13 @@ class FieldWindows:
 _NOTABLE_LOSS = 0.01
 
 
-def field_imaging(
-    lens: Lens, values: Mapping[str, Tensor], scene: Scene, whole: Sensor
-) -> ImagingSystem:
+def field_imaging(lens: Lens, scene: Scene, whole: Sensor) -> ImagingSystem:
     """Return the lens in front of the whole sensor, with a pupil that follows its values."""
-    return light_imaging(with_chosen_backend(lens.system(values)), scene, whole)
+    return light_imaging(with_chosen_backend(lens.system()), scene, whole)
 
 
 def ideal_places(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     whole: Sensor,
     points: tuple[Tensor, Tensor],
@@ -144,25 +140,23 @@ def ideal_places(
 
     Args:
         lens: as of `reference_chief_ray_map`, and the others.
-        values: the lens's variables.
         scene: planes.
         whole: the sensor.
         points: x and y, mm, each (N,), double precision.
         truth: `chief_rays`, `centroids` or `pinhole`, as of `FieldViews`.
     """
-    imaging = reference_imaging(lens, values, scene, whole)
+    imaging = reference_imaging(lens, scene, whole)
     if truth == "pinhole":
         return pinhole_places(imaging, points)
     found = chief_ray_places(imaging, points)
     if truth != CENTROIDS:
         return found
-    down, across = centroid_moves(lens, values, scene, whole, points)
+    down, across = centroid_moves(lens, scene, whole, points)
     return found._replace(rows=found.rows + down, columns=found.columns + across)
 
 
 def field_functions(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     whole: Sensor,
     points: tuple[Tensor, Tensor],
@@ -175,9 +169,9 @@ def field_functions(
     Arguments as of `ideal_places`, and pixels along each side and the model of diffraction.
     """
     found = place_functions(
-        field_imaging(lens, values, scene, whole),
+        field_imaging(lens, scene, whole),
         points,
-        ideal_places(lens, values, scene, whole, points, truth),
+        ideal_places(lens, scene, whole, points, truth),
         size,
         diffraction,
     )

@@ -160,7 +160,8 @@ class FieldViews(Imaging):
             def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
                 raw = self._raw(image.to(lens.dtype), self.seed)
                 textures = textures.to(raw)
-                object_points, _ = self._chief_ray_points(lens, values, [w.sensor for w in windows])
+                now, sensors = lens.with_values(values), [w.sensor for w in windows]
+                object_points, _ = self._chief_ray_points(now, sensors)
                 truth = _sampled(textures, object_points, windows)[:, None]
                 field = torch.stack([self.windows.coordinates(w.sensor, textures) for w in windows])
                 return comparison.loss(Views(truth, raw, field[:, None]), values)
@@ -172,7 +173,6 @@ class FieldViews(Imaging):
     def take(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         textures: Tensor,
         stage: str,
         index: int,
@@ -186,16 +186,16 @@ class FieldViews(Imaging):
         rows = everywhere[share.first : share.first + count]
         sensors = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
-        object_points, centres = self._chief_ray_points(lens, values, sensors)
+        object_points, centres = self._chief_ray_points(lens, sensors)
         windows = [SensorWindow(*pair) for pair in zip(sensors, centres, strict=True)]
         truth = _sampled(repeated, object_points, windows)
         renderer = self._training if stage == "train" else self.evaluation_renderer
         if share.total == count:
-            image = renderer.render_windows(lens, self.scene, repeated, windows, seed, values)
+            image = renderer.render_windows(lens, self.scene, repeated, windows, seed)
         else:
             whole = [window for row in everywhere for window in row]
             part = WindowShare(share.first * len(rows[0]), whole)
-            image = renderer.render_share(lens, self.scene, repeated, windows, seed, values, part)
+            image = renderer.render_share(lens, self.scene, repeated, windows, seed, part)
         field = torch.stack([self.windows.coordinates(window, textures) for window in sensors])
         truth, image, field = (
             t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
@@ -211,7 +211,7 @@ class FieldViews(Imaging):
         return [*zones, self.windows.anywhere(generator)]
 
     def _chief_ray_points(
-        self, lens: Lens, values: Mapping[str, Tensor], windows: Sequence[Sensor]
+        self, lens: Lens, windows: Sequence[Sensor]
     ) -> tuple[list[tuple[Tensor, Tensor]] | None, list[tuple[float, float]]]:
         """Return the object points of windows (rows and columns; None for a pinhole's), and where
         their textures lie, to a whole texel: `texture_centre` of each.
@@ -220,7 +220,7 @@ class FieldViews(Imaging):
             centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
             return None, centres
         of_windows = reference_centroid_map if self.truth == CENTROIDS else reference_chief_ray_map
-        object_points = of_windows(lens, values, self.scene, self.whole, windows)
+        object_points = of_windows(lens, self.scene, self.whole, windows)
         return object_points, [nearest_texel(rows, columns) for rows, columns in object_points]
 
     @property
@@ -231,7 +231,6 @@ class FieldViews(Imaging):
     def point_spread_functions(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
         size: int | None = None,
@@ -243,21 +242,18 @@ class FieldViews(Imaging):
             window = self.windows.zone(share, 0)
             side = size or self.psf_size
             renderer = PsfRenderer(window, (1, 1), pupil_samples or 32, side, jitter=False)
-            imaging = ImagingSystem.of(lens.system(values), scene, window)
+            imaging = ImagingSystem.of(lens.system(), scene, window)
             functions = renderer.point_spread_functions(imaging, 0)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
 
-    def functions_of_images(
-        self, lens: Lens, values: Mapping[str, Tensor], taken: Views, stage: str
-    ) -> Tensor:
+    def functions_of_images(self, lens: Lens, taken: Views, stage: str) -> Tensor:
         """Return the functions of the windows' middles; see `Imaging.functions_of_images`."""
         assert taken.field is not None  # of these views
         middles = taken.field.double().mean((-2, -1)).flatten(0, 1) * self.windows.half_diagonal
         renderer = self._training if stage == "train" else self.evaluation_renderer
         found = field_functions(
             lens,
-            values,
             self.scene,
             self.whole,
             (middles[:, 0], middles[:, 1]),
@@ -270,7 +266,6 @@ class FieldViews(Imaging):
     def by_place(
         self,
         lens: Lens,
-        values: Mapping[str, Tensor],
         size: tuple[int, int],
         placing: Placing | None = None,
     ) -> ByPlace:
@@ -284,15 +279,13 @@ class FieldViews(Imaging):
         def functions(rows: Tensor, columns: Tensor) -> Tensor:
             x, y = (p.to(lens.device) for p in sensor.positions(rows.double(), columns.double()))
             settings = (self.truth, self.psf_size, diffraction)
-            return field_functions(lens, values, scene, self.whole, (x, y), *settings).functions
+            return field_functions(lens, scene, self.whole, (x, y), *settings).functions
 
-        illumination = IlluminationMap.of(field_imaging(lens, values, scene, self.whole).on(sensor))
+        illumination = IlluminationMap.of(field_imaging(lens, scene, self.whole).on(sensor))
         return ByPlace(functions, illumination, window_side(functions, sensor, self.psf_size))
 
     @torch.no_grad()
-    def whole_picture(
-        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
-    ) -> WholePicture:
+    def whole_picture(self, lens: Lens, picture: Tensor, placing: Placing) -> WholePicture:
         """Image a picture that fills the sensor, as large as it fits on it, with the blur of each
         place in the field.
         """
@@ -308,11 +301,11 @@ class FieldViews(Imaging):
         sensor = Sensor(height, width, self.whole.pixel_pitch)
         scene = at_depth(self.scene, placing.depth, lens)
         renderer = self._of_whole(sensor, placing.diffraction)
-        image = renderer.render(lens, scene, picture[None], placing.seed, values)[:, 0]
+        image = renderer.render(lens, scene, picture[None], placing.seed)[:, 0]
         truth = linear_to_srgb(picture)
         if self.truth != "pinhole":
             # The distortion is part of the truth, as it is in training.
-            ((rows, columns),) = reference_chief_ray_map(lens, values, scene, self.whole, [sensor])
+            ((rows, columns),) = reference_chief_ray_map(lens, scene, self.whole, [sensor])
             truth = linear_to_srgb(sample_texture(picture, rows[0], columns[0], (0.0, 0.0)))
         mapping = (
             f"{scale:.3g} pixel(s) of the picture to one of the sensor, {width}×{height} of "

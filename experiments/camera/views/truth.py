@@ -1,6 +1,6 @@
 """Images are compared with the truth: those of an ideal or a calibrated camera."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -34,7 +34,6 @@ def check_truth(name: str, allowed: Sequence[str] = TRUTHS) -> str:
 
 def reference_chief_ray_map(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     whole: Sensor,
     windows: Sequence[Sensor],
@@ -48,15 +47,13 @@ def reference_chief_ray_map(
         Of each window rows and columns from the axis in the image of a pinhole, each
         (D, height, width), in double precision.
     """
-    object_points = chief_ray_maps(reference_imaging(lens, values, scene, whole), windows)
+    object_points = chief_ray_maps(reference_imaging(lens, scene, whole), windows)
     return [(rows[:, 0], columns[:, 0]) for rows, columns in object_points]
 
 
-def reference_imaging(
-    lens: Lens, values: Mapping[str, Tensor], scene: Scene, whole: Sensor
-) -> ImagingSystem:
+def reference_imaging(lens: Lens, scene: Scene, whole: Sensor) -> ImagingSystem:
     """Return the lens at its reference wavelength, with a pupil that is enough for chief rays."""
-    system = lens.system(values)
+    system = lens.system()
     wavelengths = (lens.primary_wavelength,)
     planes = as_planes(scene, wavelengths=wavelengths)
     pupil = differentiable_chief_pupil(
@@ -102,7 +99,6 @@ _SAMPLES = 16
 
 def reference_centroid_map(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     whole: Sensor,
     windows: Sequence[Sensor],
@@ -112,8 +108,8 @@ def reference_centroid_map(
     Coma puts the centroid of a spot beside its chief ray; images of a target, by which distortion
     is calibrated, show the centroid.  Arguments and returns as of `reference_chief_ray_map`.
     """
-    found = reference_chief_ray_map(lens, values, scene, whole, windows)
-    moves = centroid_moves(lens, values, scene, whole, _middles(windows))
+    found = reference_chief_ray_map(lens, scene, whole, windows)
+    moves = centroid_moves(lens, scene, whole, _middles(windows))
     return [
         (rows + down[:, None, None], columns + across[:, None, None])
         for (rows, columns), down, across in zip(found, *moves, strict=True)
@@ -122,7 +118,6 @@ def reference_centroid_map(
 
 def centroid_moves(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     whole: Sensor,
     points: tuple[Tensor, Tensor],
@@ -132,7 +127,6 @@ def centroid_moves(
 
     Args:
         lens: as of `reference_chief_ray_map`, and the others.
-        values: the lens's variables.
         scene: D planes.
         whole: the sensor.
         points: x and y, mm, each (N,), double precision.
@@ -140,7 +134,7 @@ def centroid_moves(
     Returns:
         Rows and columns in the image of a pinhole, each (N, D), in double precision.
     """
-    system = lens.system(values)
+    system = lens.system()
     planes = as_planes(scene, wavelengths=(lens.primary_wavelength,))
     imaging = light_imaging(system, planes, whole)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _SAMPLES, None, system)

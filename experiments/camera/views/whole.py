@@ -1,6 +1,5 @@
 """Whole pictures in front of a camera, of any size: what light falls on the sensor."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -110,7 +109,6 @@ def diffraction_of(renderer: Renderer) -> str:
 @torch.no_grad()
 def axial_function(
     lens: Lens,
-    values: Mapping[str, Tensor],
     scene: Scene,
     sensor: Sensor,
     size: int,
@@ -120,13 +118,12 @@ def axial_function(
 
     Args:
         lens: the lens, with its variables' values.
-        values: by name.
         scene: one plane.
         sensor: a small one, about the axis.
         size: pixels along each side of the functions to begin with; it grows with the blur.
         diffraction: `none`, `limit` or `wave`.
     """
-    imaging = ImagingSystem.of(lens.system(values), scene, sensor)
+    imaging = ImagingSystem.of(lens.system(), scene, sensor)
     renderer = PsfRenderer(
         sensor,
         (1, 1),
