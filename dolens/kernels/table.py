@@ -142,6 +142,10 @@ class SurfaceTable:
     codes: Tensor
     extras: Tensor
 
+    def alone(self) -> "SurfaceTable":
+        """Return the table of many lenses of which there is this one."""
+        return SurfaceTable(self.values[None], self.indices[None], self.codes, self.extras)
+
 
 # Outputs that can be differentiated, and where they lie among the numbers that the kernels keep of
 # a ray, and so where their cotangents are one.

@@ -22,7 +22,8 @@ from dolens.lens_page.tables import (
 )
 from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.fields import Fields, field_label, weights_text
-from dolens.optics.lens import Lens, Published
+from dolens.optics.lens import Lens
+from dolens.optics.lens_data import Published
 from dolens.optics.parameter_names import to_file_units
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.

@@ -169,7 +169,7 @@ LINE_G = 435.8343
 _NORMAL_OFFSET, _NORMAL_SLOPE = 0.6438, -0.001682
 # Powers of λ in Conrady's formula.
 _FIRST, _SECOND = -1.0, -3.5
-_NM_PER_UM = 1000.0
+NM_PER_UM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class ModelGlass:
             InputError: the number is no wavelength of light.
         """
         require_wavelength(wavelength)
-        micrometres = wavelength / _NM_PER_UM
+        micrometres = wavelength / NM_PER_UM
         return self.constant + self.a * micrometres**_FIRST + self.b * micrometres**_SECOND
 
 
@@ -230,7 +230,7 @@ def model_glass(
         deviation: ΔPgF.
         lines: C, d and F in nm; g is 435.8343 nm.
     """
-    c, d, f, g = (line / _NM_PER_UM for line in (*lines, LINE_G))
+    c, d, f, g = (line / NM_PER_UM for line in (*lines, LINE_G))
     dispersion = (nd - 1.0) / vd
     partial = (normal_partial_dispersion(vd) + deviation) * dispersion
     # A u + B v over (C, F) is nF - nC, and over (F, g) it is ng - nF.

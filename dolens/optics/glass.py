@@ -17,7 +17,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.dispersion import Formula, Terms, Wavelength, extremes
+from dolens.optics.dispersion import NM_PER_UM, Formula, Terms, Wavelength, extremes
 
 # °C and atm that indices hold for where nothing else is said.
 STANDARD_TEMPERATURE, STANDARD_PRESSURE = 20.0, 1.0
@@ -118,7 +118,6 @@ def absolute_change(
     return (index * index - 1.0) / (2.0 * index) * bracket
 
 
-_NM_PER_UM = 1000.0
 # The ends of most ranges are spectral lines printed to four digits, for example h, 404.6561 nm, as
 # 0.4047 µm: the line itself belongs to the range.
 _ROUNDING = 2e-4
@@ -177,7 +176,7 @@ class Glass:
         """
         self._require_within_range(wavelength)
         try:
-            index = self._index(wavelength / _NM_PER_UM)
+            index = self._index(wavelength / NM_PER_UM)
         except ZeroDivisionError:  # a resonance of the formula
             index = math.nan
         # The root of a negative square is complex to Python.

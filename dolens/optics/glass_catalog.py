@@ -214,7 +214,6 @@ _FORMULAS = {
         dispersion.herzberger,
     )
 }
-_NM_PER_UM = 1000.0
 # The source of the names that mean a maker's glass wherever no other maker here has them: the
 # catalogues of 2013 to 2022 in refractiveindex.info's database.
 _MAIN_SOURCE = "rii"
@@ -245,7 +244,7 @@ def table(maker: str) -> dict[str, dict[str, str]]:
 def table_glass(maker: str, key: str) -> Glass:
     """Return the glass of a maker's table under that name in capitals, in its own environment."""
     row: dict[str, Any] = table(maker)[key]
-    first, last = (round(_NM_PER_UM * float(word), 6) for word in row["range_um"].split())
+    first, last = (round(dispersion.NM_PER_UM * float(word), 6) for word in row["range_um"].split())
     thermal = [float(word) for word in row["thermal"].split()]
     return Glass(
         f"{maker}:{row['name']}",
@@ -336,7 +335,7 @@ def user_glass(catalogue: str, entry: AgfEntry) -> Glass:
         InputError: its numbers cannot be read (see `dolens.optics.agf.read_entry`).
     """
     glass = read_entry(entry)
-    first, last = (round(_NM_PER_UM * end, 6) for end in glass.wavelengths)
+    first, last = (round(dispersion.NM_PER_UM * end, 6) for end in glass.wavelengths)
     return Glass(
         f"{catalogue}:{glass.name}",
         *glass.dispersion,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from dolens.errors import InputError
 from dolens.optics.agf import RESISTANCES, AgfEntry, read_entry
+from dolens.optics.dispersion import NM_PER_UM
 from dolens.optics.glass import STANDARD_TEMPERATURE, Glass, absolute_change
 from dolens.optics.glass_catalog import (
     FURTHER,
@@ -23,7 +24,6 @@ from dolens.optics.glass_catalog import (
 )
 from dolens.optics.materials import LINE_D
 
-_NM_PER_UM = 1000.0
 # K; the absolute index is a polynomial of the third degree in the temperature.
 _SMALL_STEP = 0.01
 
@@ -108,7 +108,7 @@ def _dn_dt(glass: Glass) -> float | None:
     except InputError:  # the range of wavelengths has no d line
         return None
     warm, cold = (
-        absolute_change(index, LINE_D / _NM_PER_UM, glass.thermal, STANDARD_TEMPERATURE + step)
+        absolute_change(index, LINE_D / NM_PER_UM, glass.thermal, STANDARD_TEMPERATURE + step)
         for step in (_SMALL_STEP, -_SMALL_STEP)
     )
     return float(warm - cold) / (2.0 * _SMALL_STEP)

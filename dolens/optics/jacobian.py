@@ -17,7 +17,6 @@ from torch.func import jacfwd
 from dolens.errors import InputError
 from dolens.kernels.least_squares_sums import least_squares_sums
 from dolens.kernels.operators import kernels_of_lenses
-from dolens.kernels.table import SurfaceTable
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
 from dolens.optics.ray_tracing import FlatRays, choose_backend, flat_rays, trace_rays
@@ -141,7 +140,7 @@ def ray_jacobian(
     flat = flat_rays(system, rays)
     table, entries = pack_with_variables(system, flat.wavelengths, leaves)
     kernels = kernels_of_lenses(flat.position)
-    found = kernels.ray_jacobians(_alone(table), entries, outputs, _of_one_lens(flat))
+    found = kernels.ray_jacobians(table.alone(), entries, outputs, _of_one_lens(flat))
     valid, values, jacobian = (part[0] for part in found)
     if flat.before is not None and "path_length" in outputs:
         values[outputs.index("path_length")] += torch.where(valid, flat.before, 0.0)
@@ -203,7 +202,7 @@ def normal_equations(
         own = None if weight is None else weight[None]
         kernels = kernels_of_lenses(flat.position)
         found_sums = kernels.normal_equations(
-            *(_alone(table), entries, outputs, _of_one_lens(flat)),
+            *(table.alone(), entries, outputs, _of_one_lens(flat)),
             *(target[None], own, group, groups),
         )
         sums = tuple(part[0] for part in found_sums)
@@ -223,11 +222,6 @@ def normal_equations(
             jacobian=by_group[:, 2 + k :].reshape(groups, k, len(jtr)),
         ),
     )
-
-
-def _alone(table: SurfaceTable) -> SurfaceTable:
-    """Return the table of one lens as that of many, of which there is one."""
-    return replace(table, values=table.values[None], indices=table.indices[None])
 
 
 def _of_one_lens(flat: FlatRays) -> tuple[Tensor, Tensor, Tensor | None]:

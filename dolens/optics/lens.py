@@ -6,7 +6,7 @@ import fnmatch
 from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
 from pkgutil import resolve_name
 from types import MethodType
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,8 @@ from dolens.optics import LENS_METHODS
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
-from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
+from dolens.optics.lens_data import LensData
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.materials import MIRROR, Medium, media_of
@@ -69,48 +69,6 @@ def check_lens(
             raise InputError(f"{place}; the medium behind it is the one in front of it")
 
 
-class Published(NamedTuple):
-    """A `Published` holds the numbers that a patent, book or catalogue prints beside a lens.
-
-    They are data: nothing is computed from them, and they stay as they are when the lens changes.
-    None is what the source does not say.
-
-    Attributes:
-        kind: what lens it is, in the field's words, such as `Tessar`.
-        efl: effective focal length, mm; without a sign.
-        efl_tolerance: mm, by how much the prescription may miss it: half a unit of its last printed
-            digit, or more where the rounding of radii, gaps and indices allows more.
-        f_number: EFL over the diameter of the entrance pupil.
-        na: numerical aperture in image space.
-        object_na: numerical aperture in object space.
-        entrance_pupil_diameter: mm.
-        half_field: degrees.
-        image_height: mm, from the axis to the edge of the image.
-        object_height: mm.
-        bfd: back focal distance, mm.
-        length: from the first to the last vertex, mm.
-        track: from the first vertex to the image, mm.
-        magnification: image over object height.
-        note: what a reader must know: misprints, a place of the stop that is not printed, a scale.
-    """
-
-    kind: str | None = None
-    efl: float | None = None
-    efl_tolerance: float | None = None
-    f_number: float | None = None
-    na: float | None = None
-    object_na: float | None = None
-    entrance_pupil_diameter: float | None = None
-    half_field: float | None = None
-    image_height: float | None = None
-    object_height: float | None = None
-    bfd: float | None = None
-    length: float | None = None
-    track: float | None = None
-    magnification: float | None = None
-    note: str | None = None
-
-
 class Lens(LensRays, InStates, nn.Module):
     """Surfaces, gaps, media and a sensor, plane or curved.
 
@@ -127,27 +85,10 @@ class Lens(LensRays, InStates, nn.Module):
         sensor_distance: last vertex to sensor, mm.
         materials: before surface 1 and after each surface; `MIRROR` after one that reflects.
         stop: number of the stop surface, from 1.
-        index_model: the model that the materials were made with.
-        name: for titles and messages.
-        sensor_diameter: mm, the image circle the prescription gives; not tested by a trace.
-        dtype: precision of the parameters, and of the rays.
         elements: name → group of surfaces with a pose of its own.
-        wavelengths: nm, that the prescription is meant for; a trace takes its rays' own.
-        reference_wavelength: nm, one of them; the first unless it is given.
-        fields: field points that the prescription is meant for.
-        object_distance: mm from the object to the first vertex; None is infinity.
-        thermal_expansions: 1e-6/K, of the mount of the air gap behind each surface, or of glass
-            there whose catalogue does not say; None where nothing is known.
+        dtype: precision of the parameters, and of the rays.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
-        wavelength_weights: how much each of the wavelengths counts, of any sum; None: all the same.
-        temperature: °C, of the lens in use; None where the prescription does not say.
-        pressure: atm, of the air around it; likewise.
-        telecentric_object: whether chief rays are meant to be parallel to the axis in object space,
-            as the stop makes them.
-        source: the patent, book or catalogue that the prescription is taken from.
-        published: the numbers that the source prints beside it; nothing is computed from them.
-        sensor_curvature: 1/mm, of a curved sensor at its vertex; None: a plane.
-        sensor_conic: conic constant of a curved sensor; None: a sphere.
+        **data: what `LensData` holds, by its names; those that are not given have its defaults.
     """
 
     sensor_curvature: nn.Parameter | None
@@ -160,49 +101,32 @@ class Lens(LensRays, InStates, nn.Module):
         sensor_distance: float,
         materials: Sequence[Medium],
         stop: int,
-        index_model: str = "dfc",
-        name: str = "",
-        sensor_diameter: float | None = None,
-        dtype: torch.dtype = torch.float64,
         elements: Mapping[str, Element] | None = None,
-        wavelengths: Sequence[float] | None = None,
-        reference_wavelength: float | None = None,
-        fields: Fields | None = None,
-        object_distance: float | None = None,
-        thermal_expansions: Sequence[float | None] | None = None,
+        dtype: torch.dtype = torch.float64,
         backend: str = "auto",
-        wavelength_weights: Sequence[float] | None = None,
-        temperature: float | None = None,
-        pressure: float | None = None,
-        telecentric_object: bool = False,
-        source: str = "",
-        published: Published | None = None,
-        sensor_curvature: float | None = None,
-        sensor_conic: float | None = None,
+        **data: Any,
     ) -> None:
         super().__init__()
+        given = LensData(**data)
+        self.name = given.name
         try:
             check_lens(surfaces, thicknesses, materials, stop, elements or {})
         except InputError as error:
-            raise InputError(f"lens '{name}': {error}") from None
-        self.name = name
-        self.source = source
-        self.published = published
-        self.stop = stop
-        self.index_model = index_model
-        self.sensor_diameter = sensor_diameter
-        require_wavelengths(wavelengths or (), f"lens '{name}'")
+            raise InputError(f"lens '{self.name}': {error}") from None
+        self.source, self.published = given.source, given.published
+        self.stop, self.index_model = stop, given.index_model
+        self.sensor_diameter = given.sensor_diameter
+        wavelengths, weights = given.wavelengths, given.wavelength_weights
+        require_wavelengths(wavelengths or (), f"lens '{self.name}'")
         self.wavelengths = None if wavelengths is None else tuple(wavelengths)
-        if reference_wavelength is None and self.wavelengths:
-            reference_wavelength = self.wavelengths[0]
-        self.reference_wavelength = reference_wavelength
-        self.fields = fields
-        self.object_distance = object_distance
-        self.thermal_expansions = tuple(thermal_expansions or (None,) * len(surfaces))
-        self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
-        self.temperature = temperature
-        self.pressure = pressure
-        self.telecentric_object = telecentric_object
+        self.reference_wavelength = given.reference_wavelength
+        if self.reference_wavelength is None and self.wavelengths:
+            self.reference_wavelength = self.wavelengths[0]
+        self.wavelength_weights = None if weights is None else tuple(weights)
+        self.fields, self.object_distance = given.fields, given.object_distance
+        self.thermal_expansions = tuple(given.thermal_expansions or (None,) * len(surfaces))
+        self.temperature, self.pressure = given.temperature, given.pressure
+        self.telecentric_object = given.telecentric_object
         # A sentence where the stop is smaller than the aperture that its prescription asks for.
         self.stop_note = ""
         self.backend = check_backend(backend)
@@ -218,7 +142,7 @@ class Lens(LensRays, InStates, nn.Module):
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
         self.given: Mapping[str, Tensor] = {}
-        register_image_surface(self, sensor_curvature, sensor_conic, dtype)
+        register_image_surface(self, given.sensor_curvature, given.sensor_conic, dtype)
         self.to(dtype)
         self._kept_system = KeptSystem()
         self.reversals: tuple[int, ...] = ()

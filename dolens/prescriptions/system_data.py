@@ -35,7 +35,7 @@ The numbers that the lens's source publishes are in mm and degrees, each of them
 
     published: {kind: Tessar, efl: 100, efl_tolerance: 0.5, f_number: 3.5, half_field: 25.7}
 
-(see `dolens.optics.lens.Published`).
+(see `dolens.optics.lens_data.Published`).
 """
 
 import math
@@ -54,7 +54,8 @@ from dolens.optics.field_and_aperture import (
     real_marginal_height,
 )
 from dolens.optics.fields import Fields, Vignetting, require_from_the_front
-from dolens.optics.lens import Lens, Published
+from dolens.optics.lens import Lens
+from dolens.optics.lens_data import Published
 from dolens.optics.paraxial import matrix_to_stop, vergence
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.prescriptions.apertures import is_automatic

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, Status, load_lens, save_lens
-from dolens.optics.lens import Published
+from dolens.optics.lens_data import Published
 from dolens.prescriptions import (
     lens_from_prescription,
     load_prescription,

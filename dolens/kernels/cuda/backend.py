@@ -1,7 +1,5 @@
 """These functions run the Triton kernels on tensors of one lens."""
 
-from dataclasses import replace
-
 from torch import Tensor
 
 from dolens.kernels.cuda import lenses
@@ -26,7 +24,7 @@ def trace(
     Raises:
         InputError: rays that are not on a GPU, outside Triton's interpreter.
     """
-    found = lenses.trace(_alone(table), (position[None], direction[None], which))
+    found = lenses.trace(table.alone(), (position[None], direction[None], which))
     position, direction, path, status, surface = (part[0] for part in found)
     return position, direction, path, status, surface
 
@@ -62,7 +60,7 @@ def trace_adjoint(
     """
     of_position, of_direction, of_path = (None if c is None else c[None] for c in cotangents)
     found = lenses.trace_adjoint(
-        _alone(table),
+        table.alone(),
         (position[None], direction[None], which),
         status[None],
         (of_position, of_direction, of_path),
@@ -75,8 +73,3 @@ def trace_adjoint(
         of_values[0],
         of_indices[0],
     )
-
-
-def _alone(table: SurfaceTable) -> SurfaceTable:
-    """Return the table of one lens as that of many, of which there is one."""
-    return replace(table, values=table.values[None], indices=table.indices[None])
