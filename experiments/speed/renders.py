@@ -182,7 +182,9 @@ def _call(
 
     def call() -> Tensor:
         values = {n: p.clone().requires_grad_(backward) for n, p in stored.items()}
-        image = contender.renderer.render(subject.lens, subject.scene, texture, 1, values)
+        image = contender.renderer.render(
+            subject.lens.with_values(values), subject.scene, texture, 1
+        )
         if backward:
             image.square().mean().backward()
         return image

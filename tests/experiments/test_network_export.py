@@ -37,7 +37,7 @@ def camera_of(network, size=(24, 20), functions=None):
         views=SimpleNamespace(
             sensor=sensor, readouts=None, point_spread_functions=lambda lens: functions
         ),
-        lens=None,
+        lens=SimpleNamespace(with_values=lambda values: None),
         variables=dict,
         noise=lambda: network.noise_arguments((0.01, 0.0009)),
         knows_places=False,
