@@ -15,7 +15,6 @@ from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.operands import asphere_slopes, sags
 from dolens.lens_search.paraxial import Tangents
 from dolens.lens_search.search import SearchPlan, Stage, grown_starts
-from dolens.lens_search.search_rays import half_pupil
 from dolens.lens_search.specification import Limits, Specification
 from dolens.lens_search.starts import inserted, random_starts, taken_out
 from dolens.optics.surfaces.clear_aperture import Circle
@@ -151,17 +150,6 @@ def test_angles_of_chief_rays_are_those_of_rays_through_the_lens():
     slope = float(chief.slope[0, 0].norm())
     expected = slope / math.hypot(1.0, slope) - math.sin(math.radians(0.999 * 25.0))
     assert float(merit.deviations(u, here)[0, -1]) == pytest.approx(expected, abs=1e-7)
-
-
-def test_rings_up_to_the_rim_integrate_even_polynomials():
-    """∫ r^2k over the unit circle's area is 1/(k + 1)."""
-    points, weights = half_pupil(4, 6, rim=True)
-    radius = points.norm(dim=-1)
-    assert float(radius.max()) == pytest.approx(1.0, abs=1e-14)
-    for k in range(7):
-        assert float((weights * radius ** (2 * k)).sum()) == pytest.approx(1.0 / (k + 1), rel=1e-13)
-    seventh = float((weights * radius**14).sum())
-    assert abs(seventh - 1.0 / 8.0) > 1e-6
 
 
 def test_a_shell_beside_an_asphere_bends_no_ray():

@@ -22,35 +22,18 @@ from dolens.lens_search.forms import (
 from dolens.optics.paraxial import first_order
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optimize import DampedLeastSquares
-from dolens.prescriptions import lens_from_prescription
+from tests.lenses import GLASS, lens_of_rows
 
-GLASS = "1.5168/64.17"
 PLANE = math.inf
 
 
 def lens(rows, stop=1, sensor=100.0, fields=(0, 5, 10), **data):
     """A lens of rows (radius, thickness, material); a radius of None is an aperture."""
-    surfaces = {
-        str(n): {
-            **({"type": "aperture"} if radius is None else {"type": "sphere", "radius": radius}),
-            "semi_diameter": 8.0,
-            **({"thickness": thickness} if n < len(rows) else {}),
-            "material": material,
-        }
-        for n, (radius, thickness, material) in enumerate(rows, 1)
-    }
-    points = {"angles": [[0, y] for y in fields]}
-    return lens_from_prescription(
-        {
-            "stop": stop,
-            "wavelengths": [656.2725, 587.5618, 486.1327],
-            "reference_wavelength": 587.5618,
-            "fields": points,
-            "surfaces": surfaces,
-            "sensor": {"distance": sensor},
-            **data,
-        }
-    ).requires_grad_(False)
+    data |= {"fields": {"angles": [[0, y] for y in fields]}, "reference_wavelength": 587.5618}
+    waves = [656.2725, 587.5618, 486.1327]
+    return lens_of_rows(
+        *rows, semi_diameter=8.0, sensor=sensor, stop=stop, wavelengths=waves, **data
+    )
 
 
 def changed(one, **values):
@@ -179,18 +162,12 @@ def test_another_number_of_elements_is_another_form(triplet):
 
 def test_an_asphere_departs_from_its_sphere():
     def of(conic):
-        one = lens([(60.0, 4.0, GLASS), (-60.0, 0.0, "air")])
-        rows = {"type": "conic", "radius": 60.0, "conic": conic, "semi_diameter": 8.0}
-        second = {"type": "sphere", "radius": -60.0, "semi_diameter": 8.0, "material": "air"}
-        surfaces = {"1": {**rows, "thickness": 4.0, "material": GLASS}, "2": second}
-        made = lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 100.0}})
-        made.fields, made.wavelengths = one.fields, one.wavelengths
-        made.reference_wavelength = one.reference_wavelength
-        return one, made
+        front = {"type": "conic", "radius": 60.0, "conic": conic, "thickness": 4.0}
+        return lens([front | {"material": GLASS}, (-60.0, 0.0, "air")])
 
-    sphere, same = of(0.0)
-    assert lens_distance(sphere, same) < 1e-12
-    assert lens_distance(sphere, of(-400.0)[1]) > TOLERANCE
+    sphere = lens([(60.0, 4.0, GLASS), (-60.0, 0.0, "air")])
+    assert lens_distance(sphere, of(0.0)) < 1e-12
+    assert lens_distance(sphere, of(-400.0)) > TOLERANCE
 
 
 def test_at_unit_magnification_a_lens_may_be_turned_end_for_end():

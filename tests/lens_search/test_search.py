@@ -48,7 +48,7 @@ TRIPLET = Specification(
     stops=(0, 1),
     limits=Limits(glass=(1.0, 10.0), air=(0.1, 20.0), back_focus=20.0),
 )
-SMALL = SearchPlan(starts=40, batch=20, finish_rounds=3, finish_iterations=15, escapes=0)
+SMALL = SearchPlan(starts=24, batch=12, finish_rounds=3, finish_iterations=15, escapes=0)
 
 
 def test_every_place_of_the_stop_has_starts_and_no_start_is_lost():
@@ -78,3 +78,4 @@ def test_designs_keep_their_operands_and_forms_are_counted_once():
         twice = with_step(pool, step, TRIPLET, SMALL)
         for arrangement, designs in pool.items():
             assert len(twice[arrangement].values) == len(designs.values)
+    assert pool

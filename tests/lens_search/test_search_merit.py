@@ -153,12 +153,17 @@ def test_apertures_clip_as_much_light_as_may_be_vignetted():
     assert float(vignetted[-1]) < float(open_spots[-1])
 
 
-@pytest.mark.parametrize(("rings", "arms"), [(2, 4), (3, 6), (4, 8)])
-def test_half_a_pupil_integrates_even_polynomials_exactly(rings, arms):
-    points, weight = half_pupil(rings, arms)
+@pytest.mark.parametrize(
+    ("rings", "arms", "rim"),
+    [(2, 4, False), (3, 6, False), (4, 8, False), (4, 6, True)],
+)
+def test_half_a_pupil_integrates_even_polynomials_exactly(rings, arms, rim):
+    """Rings that end at the rim are exact for one power less than others."""
+    points, weight = half_pupil(rings, arms, rim=rim)
+    assert float(points.norm(dim=-1).max()) == pytest.approx(1.0, abs=1e-14) or not rim
     x, y = points.unbind(-1)
     assert bool((x > 0.0).all())
-    for power in range(2 * rings):
+    for power in range(2 * rings - rim):
         # The mean of r^(2k) over the circle.
         mean = float((weight * (x * x + y * y) ** power).sum())
         assert mean == pytest.approx(1.0 / (power + 1), rel=1e-12)

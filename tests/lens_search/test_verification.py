@@ -14,7 +14,7 @@ from dolens.lens_search.specification import Limits, Specification
 from dolens.lens_search.verification import Check, Requirements, verify
 from dolens.optics.surfaces.clear_aperture import Circle
 from dolens.optimize.operands import LensProperties, operand
-from dolens.prescriptions import lens_from_prescription
+from tests.lenses import GLASS, lens_of_rows
 
 FIELDS, RAYS = 3, 40
 
@@ -73,22 +73,11 @@ def test_apertures_that_clip_are_vignetting(triplet):
 
 def singlets(gap):
     """Two meniscus lenses whose neighbouring surfaces bulge towards each other."""
-    glass = "1.5168/64.17"
-    rows = [(80.0, 5.0, glass), (-40.0, gap, "air"), (40.0, 5.0, glass), (-80.0, 0.0, "air")]
-    surfaces = {
-        str(n): {"type": "sphere", "radius": radius, "semi_diameter": 12.0, "material": material}
-        | ({"thickness": thickness} if n < 4 else {})
-        for n, (radius, thickness, material) in enumerate(rows, 1)
-    }
-    return lens_from_prescription(
-        {
-            "stop": 1,
-            "wavelengths": [587.5618],
-            "fields": {"angles": [[0, 0], [0, 5]]},
-            "surfaces": surfaces,
-            "sensor": {"distance": 20.0},
-        }
-    ).requires_grad_(False)
+    rows = [(80.0, 5.0, GLASS), (-40.0, gap, "air"), (40.0, 5.0, GLASS), (-80.0, 0.0, "air")]
+    fields = {"angles": [[0, 0], [0, 5]]}
+    return lens_of_rows(
+        *rows, semi_diameter=12.0, sensor=20.0, wavelengths=[587.5618], fields=fields
+    )
 
 
 def test_surfaces_that_cross_within_the_beam_are_found():
@@ -105,19 +94,15 @@ def test_a_stop_within_glass_is_found():
     """A concave surface with a sag of some 1.7 mm at the beam's edge, in front of the stop."""
 
     def made(gap):
-        glass = {"material": "1.5168/64.17", "thickness": 4.0, "semi_diameter": 12.0}
-        rows = {
-            "1": {"type": "sphere", "radius": 60.0, **glass},
-            "2": {"type": "sphere", "radius": 20.0, "semi_diameter": 10.0, "material": "air"}
-            | {"thickness": gap},
-            "3": {"type": "aperture", "semi_diameter": 8.0, "material": "air", "thickness": 8.0},
-            "4": {"type": "sphere", "radius": 90.0, **glass},
-            "5": {"type": "sphere", "radius": -40.0, "semi_diameter": 12.0, "material": "air"},
-        }
+        rows = (
+            (60.0, 4.0, GLASS),
+            {"radius": 20.0, "semi_diameter": 10.0, "thickness": gap},
+            {"type": "aperture", "semi_diameter": 8.0, "thickness": 8.0},
+            (90.0, 4.0, GLASS),
+            (-40.0, 0.0, "air"),
+        )
         fields = {"angles": [[0, 0], [0, 2]]}
-        return lens_from_prescription(
-            {"stop": 3, "fields": fields, "surfaces": rows, "sensor": {"distance": 60.0}}
-        ).requires_grad_(False)
+        return lens_of_rows(*rows, semi_diameter=12.0, sensor=60.0, stop=3, fields=fields)
 
     asked = Requirements(stop_to_glass=0.0)
     inside, clear = (verify(made(gap), asked, FIELDS, RAYS) for gap in (1.0, 3.0))
@@ -154,21 +139,15 @@ def test_a_stop_between_elements_parts_no_air_space():
 
 
 def test_surfaces_are_drawn_as_far_as_their_beams_go():
-    lens = lens_from_prescription(
-        {
-            "stop": 1,
-            "fields": {"angles": [[0, 0], [0, 10]]},
-            "surfaces": {
-                "1": {"type": "aperture", "semi_diameter": 3.0, "thickness": 10.0}
-                | {"material": "air"},
-                "2": {"type": "plane", "semi_diameter": "auto", "material": "1.5"}
-                | {"thickness": 5},
-                "3": {"type": "sphere", "radius": -30.0, "semi_diameter": "auto"}
-                | {"material": "air"},
-            },
-            "sensor": {"distance": 60.0},
-        }
-    ).requires_grad_(False)
+    lens = lens_of_rows(
+        {"type": "aperture", "semi_diameter": 3.0, "thickness": 10.0},
+        {"type": "plane", "thickness": 5, "material": "1.5"},
+        (-30.0, 0.0, "air"),
+        semi_diameter="auto",
+        sensor=60.0,
+        stop=1,
+        fields={"angles": [[0, 0], [0, 10]]},
+    )
     heights = real_beams(lens, FIELDS, RAYS).heights
     # From the edge of the stop upwards at 10°.
     assert float(heights[1]) == pytest.approx(3.0 + 10.0 * math.tan(math.radians(10.0)), rel=1e-3)
@@ -181,25 +160,12 @@ def test_an_asphere_is_checked_within_its_beam():
     """A plane plate with r⁴ behind it, in a beam of 10 mm: z = a·r⁴ has the slope 4a·r³ at the rim,
     and comes nearer to the sensor by its sag there.
     """
-    lens = lens_from_prescription(
-        {
-            "stop": 1,
-            "wavelengths": [587.5618],
-            "fields": {"angles": [[0.0, 0.0], [0.0, 0.1]]},
-            "surfaces": {
-                "1": {"type": "plane", "semi_diameter": 5.0, "thickness": 1e-3, "material": "1.5"},
-                "2": {
-                    "type": "even_asphere",
-                    "radius": 1e12,
-                    "a4": 1e-3,
-                    "semi_diameter": 6.0,
-                    "material": "air",
-                },
-            },
-            "sensor": {"distance": 3.0, "diameter": 50.0},
-        },
-        dtype=torch.float64,
-        where="plate",
+    lens = lens_of_rows(
+        {"type": "plane", "thickness": 1e-3, "material": "1.5"},
+        {"type": "even_asphere", "radius": 1e12, "a4": 1e-3, "semi_diameter": 6.0},
+        sensor={"distance": 3.0, "diameter": 50.0},
+        wavelengths=[587.5618],
+        fields={"angles": [[0.0, 0.0], [0.0, 0.1]]},
     )
     found = verify(lens, Requirements(slope=20.0, back_focus=2.5, vignetting=None), 2, 40)
     height = float(found.beams.heights[1])

@@ -26,7 +26,7 @@ from dolens.manufacturing.element_sheet import element_sheet
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.lens_export import export_lens_file
 from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances, read_tolerances
-from dolens.prescriptions import lens_from_prescription
+from tests.lenses import lens_of_rows
 
 
 @pytest.fixture
@@ -125,15 +125,7 @@ def test_sags_of_a_cubic_plate_are_tabulated_over_its_aperture(lens):
 
 
 def test_a_catalogue_glass_names_its_maker():
-    lens = lens_from_prescription(
-        {
-            "surfaces": {
-                "1": {"radius": 50.0, "semi_diameter": 5, "thickness": 3, "material": "N-BK7"},
-                "2": {"radius": -50.0, "semi_diameter": 5, "material": "air"},
-            },
-            "sensor": {"distance": 50.0},
-        }
-    )
+    lens = lens_of_rows((50.0, 3, "N-BK7"), (-50.0, 0, "air"))
     rows = dict(material_rows(glass_elements(lens)[0], ShopTolerances()))
     assert (rows["glass"], rows["maker"], rows["nd"]) == ("N-BK7", "SCHOTT", "1.51680")
     assert (rows["Vd"], rows["code"]) == ("64.17", "517642")

@@ -14,22 +14,11 @@ from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.lens_export import export_lens
 from dolens.manufacturing.solids import element_solid, triangles, visible
 from dolens.manufacturing.step import export_step, product_name, read_step_file, sag_errors
-from dolens.prescriptions import lens_from_prescription
-
-GLASS = "1.5168/64.17"
-
-
-def lens_of(*surfaces, **more):
-    rows = {str(n): {"semi_diameter": 5.0, **row} for n, row in enumerate(surfaces, 1)}
-    return lens_from_prescription(
-        {"name": "test", "surfaces": rows, "sensor": {"distance": 50.0}, **more}
-    ).requires_grad_(False)
+from tests.lenses import GLASS, lens_of_rows
 
 
 def singlet(front, back, thickness=3.0, **more):
-    return lens_of(
-        {**front, "thickness": thickness, "material": GLASS}, {**back, "material": "air"}, **more
-    )
+    return lens_of_rows({**front, "thickness": thickness, "material": GLASS}, back, **more)
 
 
 SPHERE = {"type": "sphere", "radius": 20.0}
@@ -163,11 +152,11 @@ def test_rectangular_faces_make_a_rectangular_edge(tmp_path):
 
 
 def test_cemented_elements_share_a_surface_and_stops_are_no_solids(tmp_path, points):
-    lens = lens_of(
-        {**SPHERE, "thickness": 3.0, "material": GLASS},
-        {"type": "sphere", "radius": -18.0, "thickness": 2.0, "material": "1.62/36.37"},
-        {"type": "sphere", "radius": -60.0, "thickness": 2.0, "material": "air"},
-        {"type": "aperture", "semi_diameter": 3.0, "material": "air"},
+    lens = lens_of_rows(
+        (20.0, 3.0, GLASS),
+        (-18.0, 2.0, "1.62/36.37"),
+        (-60.0, 2.0, "air"),
+        {"type": "aperture", "semi_diameter": 3.0},
     )
     result = export_step(lens, tmp_path / "lens.step")
     names = [product_name(element) for element in result.elements]

@@ -4,7 +4,6 @@ import copy
 import math
 
 import pytest
-import torch
 from typer.testing import CliRunner
 
 from dolens import InputError, load_lens
@@ -12,8 +11,10 @@ from dolens.cli.app import app
 from dolens.prescriptions import load_prescription
 from dolens.prescriptions.conversion import converted
 from dolens.prescriptions.files import decode_prescription
-from tests.prescriptions.samples import SINGLET
+from tests.lenses import prescription_of_rows
+from tests.prescriptions.samples import SINGLET, require_same_parameters
 from tests.prescriptions.zemax.samples import HEAD, TAIL, TRIPLET, standard, surface
+from tests.refused import refused
 
 
 def with_row(n="1", **keys):
@@ -39,8 +40,7 @@ def test_a_design_goes_around_through_every_format_to_the_last_bit(way, root, tm
         new.write_bytes(found.data)
         assert (found.changes, found.same_numbers) == ([], True)
         path = new
-    first = dict(load_lens(root / "conf/lens/double_gauss.yaml").named_parameters())
-    assert all(torch.equal(first[n], p) for n, p in load_lens(path).named_parameters())
+    require_same_parameters(load_lens(root / "conf/lens/double_gauss.yaml"), load_lens(path))
 
 
 @pytest.mark.parametrize(
@@ -112,11 +112,8 @@ def test_catalogue_glass_becomes_its_published_nd_and_vd():
     ids=["pose", "rectangle", "power"],
 )
 def test_what_would_bend_light_otherwise_is_refused(data, suffix, said):
-    with pytest.raises(InputError) as error:
+    with refused(said, f"new{suffix}: "):
         converted(data, "old.yaml", f"new{suffix}")
-    assert str(error.value).startswith(f"new{suffix}: ")
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_the_command_writes_whole_files_and_overwrites_none_unasked(tmp_path):
@@ -153,22 +150,10 @@ def test_the_command_writes_whole_files_and_overwrites_none_unasked(tmp_path):
 
 def test_a_plastic_whose_data_begin_at_437_nm_is_written_in_every_format():
     """Indices are compared as far as a medium's data go."""
-    lens = {
-        "name": "plastic",
-        "stop": 1,
-        "wavelengths": [587.5618],
-        "surfaces": {
-            "1": {
-                "type": "sphere",
-                "radius": 20.0,
-                "semi_diameter": 5.0,
-                "thickness": 3.0,
-                "material": "PLASTIC:ZEONEX-E48R",
-            },
-            "2": {"type": "plane", "semi_diameter": 5.0, "material": "air"},
-        },
-        "sensor": {"distance": 36.0, "diameter": 10.0},
-    }
+    front = {"type": "sphere", "radius": 20.0, "thickness": 3.0, "material": "PLASTIC:ZEONEX-E48R"}
+    sensor = {"distance": 36.0, "diameter": 10.0}
+    keys = {"name": "plastic", "stop": 1, "wavelengths": [587.5618], "sensor": sensor}
+    lens = prescription_of_rows(front, {"type": "plane"}, **keys)
     assert converted(lens, "plastic", "plastic.yaml").same_numbers
     (said, *_) = converted(lens, "plastic", "plastic.seq").changes
     assert "from 450 to 700 nm" in said

@@ -39,20 +39,9 @@ def lens_with(end="", **given):
 # YAML has numbers to other bases and dates, which a lens's numbers are not.
 @pytest.mark.parametrize(
     "text",
-    [
-        "0b",
-        "0b1",
-        "0x1F",
-        "1:60",
-        "1:30",
-        "190:20:30.5",
-        "2001-13-01",
-        "2001-12-14",
-        "yes",
-        "=",
-        "x",
-    ],
-)
+    ["0b", "0b1", "0x1F", "1:60", "1:30", "190:20:30.5", "2001-13-01", "2001-12-14", "yes", "=",
+     "x"],
+)  # fmt: skip
 def test_what_is_no_decimal_number_is_refused_by_its_key(text, tmp_path):
     said = "'sensor.distance' must be a number, not "
     require_refused(tmp_path / "lens.yaml", lens_with(distance=text), said)

@@ -4,12 +4,13 @@ explains.
 
 import pytest
 
-from dolens import InputError, load_lens
+from dolens import InputError
 from dolens.optics.glass_catalog import user_entries
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.prescriptions.files import read_lens_file
 from scripts.fuzz_lens_files import outcome
 from tests.prescriptions.large_files import GREEDY, LARGE, YAML, ZEMAX, configurations
+from tests.prescriptions.samples import require_refused
 
 # Bytes: what took time with the square of its size took minutes with so many.
 SIZE = 150_000
@@ -34,15 +35,6 @@ def test_a_small_file_that_names_a_large_number_is_a_lens_or_one_line(kind, tmp_
     path.write_text(text)
     said = outcome(path)
     assert said[0] in ("lens", "one line"), said
-
-
-def refused(text, suffix, said, tmp_path):
-    path = tmp_path / f"own{suffix}"
-    path.write_text(text)
-    with pytest.raises(InputError) as error:
-        load_lens(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert said in str(error.value)
 
 
 SURFACES = "".join(f"SURF {n}\n  CURV 0.01\n  DISZ 1\n" for n in range(30_000))
@@ -82,7 +74,7 @@ LIMITS = {
 @pytest.mark.parametrize("kind", LIMITS)
 def test_a_limit_is_said(kind, tmp_path):
     suffix, text, said = LIMITS[kind]
-    refused(text, suffix, said, tmp_path)
+    require_refused(tmp_path / f"own{suffix}", text, said)
 
 
 def test_an_outline_has_ten_thousand_corners_at_most():

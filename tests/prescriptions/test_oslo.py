@@ -1,12 +1,11 @@
 """OSLO's .len format: what its files mean, and what is refused."""
 
 import pytest
-import torch
 
 from dolens import load_lens
 from dolens.prescriptions.oslo import read_oslo
 from tests.prescriptions.codev.samples import TRIPLET as CODE_V_TRIPLET
-from tests.prescriptions.samples import require_refused
+from tests.prescriptions.samples import require_refused, require_same_parameters
 
 # The supplement's triplet, as OSLO writes.
 TRIPLET = """// OSLO 6.6 55487     0 50466
@@ -78,9 +77,7 @@ def test_the_same_lens_in_codes_of_glass_is_the_same_in_code_v(tmp_path):
     for name, text in (("lens.len", own), ("lens.seq", other)):
         (tmp_path / name).write_text(text)
         lenses.append(load_lens(tmp_path / name))
-    first, second = (dict(lens.named_parameters()) for lens in lenses)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(value, second[name]) for name, value in first.items())
+    require_same_parameters(*lenses)
     assert [(m.a, m.b) for m in lenses[0].materials] == [(m.a, m.b) for m in lenses[1].materials]
     assert [s.semi_diameter for s in lenses[0].surfaces.values()] == [
         s.semi_diameter for s in lenses[1].surfaces.values()

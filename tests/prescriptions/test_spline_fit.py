@@ -1,7 +1,6 @@
 """Fits of B-spline surfaces to sag data, and what a prescription makes of them."""
 
 import math
-import re
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from scipy.interpolate import BSpline as SciPySpline
 from dolens import InputError, load_lens, save_lens
 from dolens.optics.surfaces.b_spline import clamped_knots
 from dolens.prescriptions import fit_b_spline, lens_from_prescription, prescription_of
+from tests.refused import refused
 
 KNOTS_X = clamped_knots(5.0, 12)
 # Uneven, with a crease.
@@ -137,9 +137,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_data(case):
     given, said = BAD[case]
-    with pytest.raises(InputError, match=re.escape(said)) as error:
+    with refused(said):
         fit_b_spline(*given)
-    assert "\n" not in str(error.value)
 
 
 def prescription(**front):
@@ -215,9 +214,8 @@ def test_bad_rows(case):
     given, said = BAD_ROWS[case]
     coefficients = {} if "type" in given else {"coefficients": rows()}
     data = prescription(**{**coefficients, **given})
-    with pytest.raises(InputError, match=re.escape(said)) as error:
+    with refused(said, "here: surface 1: "):
         lens_from_prescription(data, where="here")
-    assert re.fullmatch("here: surface 1: .*", str(error.value))
 
 
 def test_a_fit_is_a_surface_of_a_prescription():

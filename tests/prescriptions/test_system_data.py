@@ -10,6 +10,7 @@ from dolens.analysis.conditions import conditions
 from dolens.experiments.design.states import set_entrance_pupils
 from dolens.lens_page.tables import first_order_table
 from dolens.prescriptions import lens_from_prescription, prescription_of
+from tests.refused import refused
 
 SINGLET = {
     "stop": 2,
@@ -157,11 +158,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_conditions(case):
     keys, said = BAD[case]
-    with pytest.raises(InputError) as error:
+    with refused(said, "x.yaml: "):
         lens_from_prescription(used_with(**keys), where="x.yaml")
-    assert str(error.value).startswith("x.yaml: ")
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_a_pupil_that_its_stop_cannot_reach():

@@ -86,7 +86,7 @@ def two(tmp_path_factory):
     started = [context.Process(target=work, args=(rank, store, results)) for rank in range(2)]
     for process in started:
         process.start()
-    found = sorted([results.get(timeout=60) for _ in started], key=lambda entry: entry[0])
+    found = sorted([results.get(timeout=300) for _ in started], key=lambda entry: entry[0])
     for process in started:
         process.join()
     for _, values, *_ in found:

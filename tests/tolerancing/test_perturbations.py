@@ -8,6 +8,7 @@ from scipy import integrate, stats
 
 from dolens import InputError
 from dolens.tolerancing import scaled_tolerances, tolerances_from
+from tests.refused import refused
 
 
 def test_units_are_those_of_files(triplet):
@@ -106,9 +107,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_gives_one_line_that_names_the_key(triplet, case):
     given, expected = BAD[case]
-    with pytest.raises(InputError) as caught:
+    with refused(expected):
         tolerances_from(triplet, given)
-    assert expected in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_arrays_are_refused(root):

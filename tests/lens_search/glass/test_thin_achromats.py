@@ -8,7 +8,7 @@ from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_s
 from dolens.lens_search.glass.thin_achromats import _seidel, best_achromats, thin_achromats
 from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.seidel import seidel
-from dolens.prescriptions.build import lens_from_prescription
+from tests.lenses import lens_of_rows
 
 F, D, E, C = 486.1327, 587.5618, 546.074, 656.2725
 
@@ -51,15 +51,9 @@ def test_aberrations_are_those_of_the_traced_lens(schott, names):
     radii = [float(focal / c) for c in found.curvatures[0]]
     media = [f"SCHOTT:{name}" for name in names]
     thin = 1e-7
-    surfaces = {
-        "1": {"radius": radii[0], "semi_diameter": height, "thickness": thin, "material": media[0]},
-        "2": {"radius": radii[1], "semi_diameter": 3.0, "thickness": thin, "material": media[1]},
-        "3": {"radius": radii[2], "semi_diameter": 3.0, "material": "air"},
-    }
-    lens = lens_from_prescription(
-        {"name": "thin", "stop": 1, "surfaces": surfaces, "sensor": {"distance": 100.0}},
-        dtype=torch.float64,
-    )
+    front = {"radius": radii[0], "semi_diameter": height, "thickness": thin, "material": media[0]}
+    rows = front, (radii[1], thin, media[1]), (radii[2], 0.0, "air")
+    lens = lens_of_rows(*rows, semi_diameter=3.0, sensor=100.0, stop=1)
     assert lens.first_order(D).efl.item() == pytest.approx(focal, rel=1e-6)
     for at, line in enumerate((F, D, C)):
         sums = seidel(lens.system(), line, field)

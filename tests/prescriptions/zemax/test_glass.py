@@ -15,6 +15,7 @@ from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.zemax.glass import read_glass
 from dolens.prescriptions.zemax.reader import prescription_from_zemax, read_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
+from tests.lenses import lens_of_rows
 from tests.prescriptions.zemax.samples import singlet, surface
 
 NOTHING = "0 0 1.5 40 0 0 0 0 0 0"  # what Zemax writes beside a name
@@ -218,14 +219,8 @@ def test_what_can_be(glas, catalogues, name):
 
 
 def lens_of(first, second="air", **keys):
-    rows = {
-        "1": {"radius": 50.0, "semi_diameter": 5.0, "thickness": 6.0, "material": first},
-        "2": {"radius": -80.0, "semi_diameter": 5.0, "thickness": 2.0, "material": second},
-        "3": {"radius": -90.0, "semi_diameter": 5.0, "material": "air"},
-    }
-    return lens_from_prescription(
-        {"name": "Doublet", "surfaces": rows, "sensor": {"distance": 50.0}, **keys}
-    )
+    rows = (50.0, 6.0, first), (-80.0, 2.0, second), (-90.0, 0.0, "air")
+    return lens_of_rows(*rows, name="Doublet", **keys)
 
 
 KINDS = ["air", "occluder", "1.5", "2", "0.9997", "1.51680/64.17", "1.51680/64.17/0",

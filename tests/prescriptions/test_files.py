@@ -1,12 +1,13 @@
-"""A folder of lens files is checked, whatever its files hold."""
+"""Lenses are loaded by name or path; a folder of files is checked, whatever they hold."""
 
 import json
 
 import pytest
 from typer.testing import CliRunner
 
-from dolens import InputError
+from dolens import InputError, load_lens
 from dolens.cli.app import app
+from dolens.prescriptions import lens_names
 from dolens.prescriptions.files import check_file, lens_files, summary
 from tests.prescriptions.zemax.samples import GLASS, singlet, triplet
 
@@ -64,3 +65,27 @@ def test_a_reason_is_counted_without_places_and_numbers(folder):
     checks = [check_file(folder / name) for name in ("grin.zmx", "grin2.zmx")]
     reason = "a numerical aperture in object space needs a finite object"
     assert summary(checks) == [(".zmx", reason, 2)]
+
+
+def test_a_bare_name_means_a_lens_of_the_package(root, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    lens = load_lens("cooke_triplet")
+    assert lens.name == "Cooke triplet" and len(lens.surfaces) == 6
+    names = lens_names()
+    assert names == sorted(path.stem for path in (root / "conf/lens").glob("*.yaml"))
+
+
+def test_an_unknown_name_is_answered_with_near_ones(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"did you mean 'cooke_triplet'.*nikon"):
+        load_lens("cook_triplet")
+
+
+def test_a_path_is_never_taken_for_a_name(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for path in ("conf/nikon", "nikon.yaml"):
+        with pytest.raises(InputError, match=r"end in|cannot be read"):
+            load_lens(path)
+    (tmp_path / "nikon").write_text("no lens")
+    with pytest.raises(InputError, match="end in"):
+        load_lens("nikon")

@@ -1,11 +1,12 @@
-"""Point spread functions as counted electrons."""
+"""Noise of point spread functions as counted electrons, and of parts of a batch."""
 
 import math
 
 import pytest
 import torch
 
-from dolens.sensor.noise import noisy_point_spread_functions
+from dolens.sensor.noise import BatchShare, noisy_point_spread_functions
+from dolens.sensor.readout import Readout
 
 
 def test_a_measured_function_has_poisson_s_spread_about_the_true_one():
@@ -33,3 +34,22 @@ def test_many_electrons_measure_the_function_itself():
     with pytest.raises(AssertionError):
         few = noisy_point_spread_functions(exact, 1e2, 0.0, torch.Generator().manual_seed(0))
         assert torch.allclose(few, exact, rtol=1e-2)
+
+
+READOUTS = {
+    "electrons": Readout(exposure=0.5, full_well=900.0, read_noise=0.01, bits=10),
+    "mosaic": Readout(full_well=500.0, read_noise=0.02, pattern="RGGB"),
+}
+
+
+@pytest.mark.parametrize("name", READOUTS)
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_parts_have_the_noise_of_the_whole(name, size):
+    readout = READOUTS[name]
+    image = torch.rand(6, 2, 3, 5, 7)
+
+    def read(part, share=None):
+        return readout(part, torch.Generator().manual_seed(3), share)
+
+    parts = [read(image[i : i + size], BatchShare(i, 6)) for i in range(0, 6, size)]
+    assert torch.equal(torch.cat(parts), read(image))

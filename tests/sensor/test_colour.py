@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dolens.errors import InputError
 from dolens.sensor.colour import PATTERNS, demosaic, mosaic
+from tests.refused import refused
 
 SIZES = [(3, 3), (4, 6), (5, 4), (7, 9)]
 
@@ -169,6 +169,5 @@ BAD_INPUT = {
 @pytest.mark.parametrize("case", BAD_INPUT)
 def test_bad_input_gives_one_clear_line(case):
     call, expected = BAD_INPUT[case]
-    with pytest.raises(InputError) as caught:
+    with refused(expected):
         call()
-    assert expected in str(caught.value) and "\n" not in str(caught.value)
