@@ -4,7 +4,7 @@ import copy
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ class Measurement:
         """Take the fields alone to another process: what is cached within a derivative
         (`torch.func.jvp`) cannot be stored.
         """
-        return type(self), tuple(getattr(self, field.name) for field in fields(self))
+        return type(self), tuple(getattr(self, each.name) for each in fields(self))
 
     @cached_property
     def totals(self) -> Tensor:
@@ -100,18 +100,40 @@ class Measurement:
         return torch.stack([(share.sum(0) * x).sum(), (share.sum(1) * y).sum()])
 
 
+@dataclass(frozen=True)
+class Light:
+    """Describes light and noise of simulated measurements.
+
+    Attributes:
+        photons: of each image, behind the lens; those beyond the sensor's edge are among them.
+        read_noise: RMS of a pixel, electrons.
+        full_well: electrons at which a pixel saturates; None: never.
+        unmodelled: what a measurement has and the model of a fit has not.
+
+    Raises:
+        InputError: a number out of range.
+    """
+
+    photons: float = 4_000_000
+    read_noise: float = 2.0
+    full_well: float | None = None
+    unmodelled: Unmodelled = field(default_factory=Unmodelled)
+
+    def __post_init__(self) -> None:
+        for name, least in (("photons", 1.0), ("read_noise", 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; allowed: {least:g} or more")
+
+
 @torch.no_grad()
 def simulated(
     lens: Lens,
     sources: Tensor,
     wavelength: float,
     sensor: Sensor,
-    photons: int,
-    read_noise: float,
+    light: Light,
     generator: torch.Generator,
-    full_well: float | None = None,
     planes: Sequence[float] = (0.0,),
-    unmodelled: Unmodelled | None = None,
 ) -> Measurement:
     """Simulate images: photons leave each source in random directions and are counted where they
     arrive.
@@ -123,28 +145,30 @@ def simulated(
         sources: (S, 3), mm.
         wavelength: nm.
         sensor: the pixels.
-        photons: behind the lens, of each source; those beyond the sensor's edge are among them.
-        read_noise: RMS, electrons.
+        light: of each image; pixels that it saturates are not trusted.  The lens has its errors
+            of radius and index already.
         generator: of directions and noise.
 
     Rarely needed:
-        full_well: electrons at which a pixel saturates, and is not trusted; None: never.
         planes: where the sensor stands, mm from where the lens has it; an exposure of each source
             on each.
-        unmodelled: the source's size, background and diffraction; None: none of them.
 
     Raises:
         InputError: no light passes.
     """
-    effects = unmodelled or Unmodelled()
+    effects, photons = light.unmodelled, int(light.photons)
+    diameter = effects.source_diameter
     images = []
     moved = [copy.deepcopy(lens) for _ in planes]
     for one, plane in zip(moved, planes, strict=True):
         one.sensor_distance.add_(plane)
     for source, one in itertools.product(sources.double(), moved):
         image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
-        light = (one, source, wavelength, sensor, photons, effects.source_diameter, generator)
-        for x, y in (_by_waves if effects.diffraction else _by_rays)(*light):
+        places = _by_rays(one, source, wavelength, photons, diameter, generator)
+        if effects.diffraction:
+            fine = diffracted_light(one, source, wavelength, sensor, diameter)
+            places = iter([fine.photons(photons, diameter, generator)])
+        for x, y in places:
             rows, columns = (p.round() for p in sensor.pixels(x, y))
             inside = (
                 (rows >= 0) & (rows < sensor.height) & (columns >= 0) & (columns < sensor.width)
@@ -154,19 +178,18 @@ def simulated(
         if effects.background > 0.0:
             image += torch.poisson(torch.full_like(image, effects.background), generator)
         noise = torch.randn(image.shape, generator=generator, dtype=torch.float64)
-        images.append((image + read_noise * noise).reshape(sensor.height, sensor.width))
+        images.append((image + light.read_noise * noise).reshape(sensor.height, sensor.width))
     stacked = torch.stack(images)
     mask = torch.ones_like(stacked, dtype=torch.bool)
-    if full_well is not None:
-        mask = stacked < full_well
-    return Measurement(stacked, mask, read_noise, sensor)
+    if light.full_well is not None:
+        mask = stacked < light.full_well
+    return Measurement(stacked, mask, light.read_noise, sensor)
 
 
 def _by_rays(
     lens: Lens,
     source: Tensor,
     wavelength: float,
-    sensor: Sensor,
     photons: int,
     source_diameter: float,
     generator: torch.Generator,
@@ -183,20 +206,6 @@ def _by_rays(
         x, y = x[: photons - passed], y[: photons - passed]
         passed += len(x)
         yield x, y
-
-
-def _by_waves(
-    lens: Lens,
-    source: Tensor,
-    wavelength: float,
-    sensor: Sensor,
-    photons: int,
-    source_diameter: float,
-    generator: torch.Generator,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield the same with diffraction, all at once."""
-    light = diffracted_light(lens, source, wavelength, sensor, source_diameter)
-    yield light.photons(photons, source_diameter, generator)
 
 
 def _directions(

@@ -13,6 +13,8 @@ from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
+from dolens.errors import InputError
+from dolens.files import written_whole
 from dolens.html import Child, Markup, element, joined, table
 from dolens.lens_page.markup import Block, figure_html, inline_svg, page_html, problem_html
 from dolens.lens_page.tables import number
@@ -42,26 +44,30 @@ class Pictures:
     course: Figure | None = None
 
 
-def forms_page(
+def write_page(
     reports: Sequence[FormReport],
+    folder: str | Path,
     title: str,
     facts: Sequence[tuple[str, str]],
     pictures: Pictures,
     found: int,
-    folder: str | Path,
     merit_label: str = "merit",
-) -> str:
-    """Return the page as the text of an HTML file.
+) -> None:
+    """Write `forms.html`; it links to the reports' files, wherever they lie.
 
     Args:
         reports: of the forms, the best first.
+        folder: that the page goes to.
         title: of the page.
         facts: what and how much, for its heading.
         pictures: of the search.
         found: how many forms there are in all.
-        folder: that the page will lie in; it links to files from there.
         merit_label: of the merit, with its unit.
+
+    Raises:
+        InputError: the page cannot be written.
     """
+    folder = Path(folder)
     best = reports[0].found
     told = [
         *facts,
@@ -69,7 +75,7 @@ def forms_page(
         ("best mean RMS spot", f"{number(best.mean_rms_spot_um, 4)} µm"),
     ]
     blocks = [
-        Block("forms", "Forms", _cards(reports, found, Path(folder))),
+        Block("forms", "Forms", _cards(reports, found, folder)),
         Block("comparison", "Comparison", _comparison(reports, merit_label)),
         Block("checks", "Checks by real rays", _checks(reports)),
     ]
@@ -81,8 +87,13 @@ def forms_page(
             with laid_out(figure):
                 svg = inline_svg(figure, name, heading)
             blocks.append(Block(name, heading, figure_html(svg, False)))
-    blocks.append(Block("files", "Prescriptions", file_table(reports, Path(folder))))
-    return page_html(title, told, "", blocks, STYLE, GENERATOR)
+    blocks.append(Block("files", "Prescriptions", file_table(reports, folder)))
+    page = page_html(title, told, "", blocks, STYLE, GENERATOR)
+    try:
+        with written_whole(folder / "forms.html") as aside:
+            aside.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
 
 
 def _cards(reports: Sequence[FormReport], found: int, folder: Path) -> Markup:

@@ -1,9 +1,7 @@
-"""A search is reported: its course over time, a map of its starts, figures and a page."""
+"""A search is reported: its course over time, a map of its starts, and sections of its forms."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from matplotlib.figure import Figure
@@ -11,45 +9,9 @@ from torch import Tensor
 
 from dolens.analysis.conditions import conditions
 from dolens.errors import InputError
-from dolens.files import written_whole
 from dolens.lens_page.tables import number
 from dolens.lens_search.form_report import FormReport
-from dolens.lens_search.page import Pictures, forms_page
 from dolens.plotting.small_sections import FormPicture, forms_figure
-
-logger = logging.getLogger(__name__)
-
-
-def write_page(
-    reports: Sequence[FormReport],
-    folder: str | Path,
-    title: str,
-    facts: Sequence[tuple[str, str]],
-    pictures: Pictures,
-    found: int,
-    merit_label: str = "merit",
-) -> None:
-    """Write `forms.html`; it links to the reports' files, wherever they lie.
-
-    Args:
-        reports: of the forms, the best first.
-        folder: that the page goes to.
-        title: of the page.
-        facts: what and how much, for its heading.
-        pictures: of the search.
-        found: how many forms there are in all.
-        merit_label: of the merit, with its unit.
-
-    Raises:
-        InputError: the page cannot be written.
-    """
-    folder = Path(folder)
-    page = forms_page(reports, title, facts, pictures, found, folder, merit_label)
-    try:
-        with written_whole(folder / "forms.html") as aside:
-            aside.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
 
 
 def sections_figure(reports: Sequence[FormReport], title: str | None = None) -> Figure | None:

@@ -17,9 +17,9 @@ from dolens.lens_search.form_report import FormReport, glasses_text, report_form
 from dolens.lens_search.forms import FoundLens, distinct
 from dolens.lens_search.glass.glass_merit import merit_of
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.page import Pictures
+from dolens.lens_search.page import Pictures, write_page
 from dolens.lens_search.search import SearchPlan, Step, with_step
-from dolens.lens_search.search_report import search_course, sections_figure, start_map, write_page
+from dolens.lens_search.search_report import search_course, sections_figure, start_map
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.verification import Requirements
 from dolens.plotting.search import search_course_figure, starts_figure

@@ -174,6 +174,10 @@ def first_start(specification: Specification) -> Lens:
     return designed_lens(arrangement, specification, starts[0], "first start")
 
 
+# Files of another one are those of another search.
+_FORMAT = 2
+
+
 class KeptSteps:
     """Reads the steps of earlier tries from a folder, and writes those of this one.
 
@@ -196,7 +200,8 @@ class KeptSteps:
         choice = specification.glass_choice
         # Glasses are kept by their numbers: a catalogue that has changed has others.
         names = choice and chosen_glasses(choice, tuple(specification.wavelengths)).names
-        text = json.dumps([asdict(specification), asdict(plan), names], sort_keys=True)
+        parts = [_FORMAT, asdict(specification), asdict(plan), names]
+        text = json.dumps(parts, sort_keys=True)
         self._digest = hashlib.sha256(text.encode()).hexdigest()
         self._started = time.perf_counter()
 
@@ -230,24 +235,7 @@ class KeptSteps:
         plain = {
             "digest": self._digest,
             "seconds": self.seconds_before + time.perf_counter() - self._started,
-            "features": step.features,
-            "first": step.first,
-            "iterations": step.iterations,
-            "continuous": step.continuous,
-            "designs": [
-                {
-                    "groups": list(designs.arrangement.groups),
-                    "stop": designs.arrangement.stop,
-                    "within": designs.arrangement.within,
-                    "terms": list(designs.arrangement.terms),
-                    "values": designs.values,
-                    "spots": designs.spots,
-                    "violation": designs.violation,
-                    "starts": designs.starts,
-                    "history": [list(words) for words in designs.history],
-                }
-                for designs in step.designs
-            ],
+            "step": asdict(step),
         }
         with written_whole(path) as aside:
             torch.save(plain, aside)
@@ -260,19 +248,9 @@ class KeptSteps:
                 "with other glasses; remove the folder, or choose another run folder"
             )
         self.seconds_before = max(self.seconds_before, float(plain["seconds"]))
+        step = plain["step"]
         designs = tuple(
-            Designs(
-                Arrangement(
-                    tuple(part["groups"]), part["stop"], part["within"], tuple(part["terms"])
-                ),
-                part["values"],
-                part["spots"],
-                part["violation"],
-                part["starts"],
-                tuple(tuple(words) for words in part["history"]),
-            )
-            for part in plain["designs"]
+            Designs(**{**part, "arrangement": Arrangement(**part["arrangement"])})
+            for part in step["designs"]
         )
-        return Step(
-            designs, plain["features"], plain["first"], plain["iterations"], plain["continuous"]
-        )
+        return Step(**{**step, "designs": designs})

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import fisher_information
+from dolens.alignment.measurement import Light
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
@@ -30,7 +31,7 @@ from dolens.experiments.poses.accuracy_tasks import (
     errors_by_rays,
     linearised,
 )
-from dolens.experiments.poses.bench import Bench, Light, check_precision
+from dolens.experiments.poses.bench import Bench, check_precision
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens

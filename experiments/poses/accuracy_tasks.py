@@ -13,10 +13,10 @@ from torch import Tensor
 
 from dolens.alignment.image_losses import SpotLoss
 from dolens.alignment.information import FisherInformation, fisher_information
-from dolens.alignment.measurement import Measurement
+from dolens.alignment.measurement import Light, Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
-from dolens.experiments.poses.bench import Bench, Light, draw, simulate
+from dolens.experiments.poses.bench import Bench, draw, simulate
 from dolens.experiments.poses.fit_plan import Stage, plain_imager, spot_imager, stage_of
 from dolens.experiments.poses.fitting import iterate, loss_of, optimizer_of
 from dolens.experiments.settings import check_count, check_not_negative, check_positive

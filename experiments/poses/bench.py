@@ -1,14 +1,13 @@
 """A bench of sources and a sensor: its light gives measurements, simulated or photographed."""
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
-from dolens.alignment.measurement import Measurement, read_measurements, simulated
+from dolens.alignment.measurement import Light, Measurement, read_measurements, simulated
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
@@ -68,31 +67,6 @@ class Bench:
         return Pose(lens, self.sources, variables or {}, self.planes)
 
 
-@dataclass(frozen=True)
-class Light:
-    """Describes light and noise of simulated measurements.
-
-    Attributes:
-        photons: of each image, behind the lens; those beyond the sensor's edge are among them.
-        read_noise: RMS of a pixel, electrons.
-        full_well: electrons at which a pixel saturates; None: never.
-        unmodelled: what a measurement has and the model of a fit has not.
-
-    Raises:
-        InputError: a number out of range.
-    """
-
-    photons: float = 4_000_000
-    read_noise: float = 2.0
-    full_well: float | None = None
-    unmodelled: Unmodelled = field(default_factory=Unmodelled)
-
-    def __post_init__(self) -> None:
-        for name, least in (("photons", 1.0), ("read_noise", 0.0)):
-            if not least <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; allowed: {least:g} or more")
-
-
 def light_of(
     photons: float = 4_000_000,
     read_noise: float = 2.0,
@@ -131,12 +105,9 @@ def simulate(
         pose.places,
         bench.wavelength,
         bench.sensor,
-        int(light.photons),
-        light.read_noise,
+        light,
         generator,
-        light.full_well,
         pose.planes,
-        effects,
     )
 
 

@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import FisherInformation, fisher_information
-from dolens.alignment.measurement import Measurement
+from dolens.alignment.measurement import Light, Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.bench import (
     Bench,
-    Light,
     check_precision,
     draw,
     repetitions,

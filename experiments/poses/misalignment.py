@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from dolens.alignment.information import FisherInformation, fisher_information
-from dolens.alignment.measurement import Measurement
+from dolens.alignment.measurement import Light, Measurement
 from dolens.errors import check_choice
 from dolens.experiments.experiment import Experiment, Figures
-from dolens.experiments.poses.bench import Bench, Light, Observations, check_precision, repetitions
+from dolens.experiments.poses.bench import Bench, Observations, check_precision, repetitions
 from dolens.experiments.poses.fit_plan import FitPlan, values_imager
 from dolens.experiments.poses.fitting import (
     Estimates,

@@ -14,7 +14,7 @@ from dolens.alignment.image_losses import (
     spill_left,
 )
 from dolens.alignment.information import fisher_information
-from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.measurement import Light, Measurement, simulated
 from dolens.alignment.pose import Pose
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
@@ -41,9 +41,7 @@ def seen(lens):
     true = pose(lens, TRUTH)
     true.store()
     generator = torch.Generator().manual_seed(3)
-    return simulated(
-        true.lens, true.sources, 622.5, SENSOR, PHOTONS, 2.0, generator, planes=true.planes
-    )
+    return simulated(true.lens, true.sources, 622.5, SENSOR, Light(PHOTONS), generator, true.planes)
 
 
 def test_derivatives_leave_out_what_wide_patches_spill_onto_dark_pixels(singlet):

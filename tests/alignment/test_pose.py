@@ -12,7 +12,13 @@ from PIL import Image
 
 from dolens.alignment.image_losses import ImageMerit, ImageResiduals, NoiseWeightedLoss, SpotLoss
 from dolens.alignment.information import FisherInformation, fisher_information
-from dolens.alignment.measurement import Measurement, read_measurement, read_measurements, simulated
+from dolens.alignment.measurement import (
+    Light,
+    Measurement,
+    read_measurement,
+    read_measurements,
+    simulated,
+)
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
@@ -37,7 +43,7 @@ def seen(lens, photons=400_000, read_noise=2.0, seed=0, sensor=SENSOR, **truth):
     true = pose(lens, **truth)
     true.store()
     generator = torch.Generator().manual_seed(seed)
-    return simulated(true.lens, true.sources, 622.5, sensor, photons, read_noise, generator)
+    return simulated(true.lens, true.sources, 622.5, sensor, Light(photons, read_noise), generator)
 
 
 def fitted(loss, fit, iterations=15):
@@ -354,10 +360,9 @@ def test_a_second_plane_is_the_sensor_moved(singlet):
         two.sources,
         622.5,
         SENSOR,
-        400_000,
-        2.0,
+        Light(400_000),
         torch.Generator().manual_seed(0),
-        planes=two.planes,
+        two.planes,
     )
     assert measured.images.shape == (2, 48, 48)
     assert torch.allclose(measured.centroids()[1], images[1].centroid, atol=5e-3)

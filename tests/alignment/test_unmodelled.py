@@ -9,7 +9,7 @@ import yaml
 
 from dolens.alignment.image_losses import ImageMerit, NoiseWeightedLoss
 from dolens.alignment.information import fisher_information
-from dolens.alignment.measurement import simulated
+from dolens.alignment.measurement import Light, simulated
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled, diffracted_light, unmodelled_of
 from dolens.errors import InputError
@@ -56,10 +56,8 @@ def seen(lens, effects=None, photons=PHOTONS, read_noise=0.0, seed=0, sensor=SEN
         SOURCE,
         WAVELENGTH,
         sensor,
-        photons,
-        read_noise,
+        Light(photons, read_noise, unmodelled=effects or Unmodelled()),
         seeded(seed),
-        unmodelled=effects,
     )
 
 

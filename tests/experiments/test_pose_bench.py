@@ -6,8 +6,9 @@ import pytest
 import torch
 import yaml
 
+from dolens.alignment.measurement import Light
 from dolens.errors import InputError
-from dolens.experiments.poses.bench import Bench, Light, Observations, draw, light_of, simulate
+from dolens.experiments.poses.bench import Bench, Observations, draw, light_of, simulate
 from dolens.experiments.poses.fit_plan import fit_plan
 from dolens.prescriptions import lens_from_prescription
 from dolens.sensor.pixels import Sensor

@@ -18,8 +18,8 @@ from dolens.lens_search.form_report import (
     write_form,
 )
 from dolens.lens_search.forms import FoundLens, distinct
-from dolens.lens_search.page import Pictures
-from dolens.lens_search.search_report import search_course, sections_figure, start_map, write_page
+from dolens.lens_search.page import Pictures, write_page
+from dolens.lens_search.search_report import search_course, sections_figure, start_map
 from dolens.lens_search.verification import Requirements
 from tests.lens_page.conftest import Page
 

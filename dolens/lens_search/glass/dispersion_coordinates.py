@@ -32,7 +32,7 @@ The region of existing glasses, as linear inequalities that keep continuous glas
 The region is the convex hull of a set of glasses in their coordinates (see
 `dolens.lens_search.glass.dispersion_coordinates`), A x ≤ b with unit rows of A: A x - b is then the
 distance beyond a face, in the units of the coordinates.  A hull reaches over gaps, so a glass
-within it may still be far from any real one; `pull` measures that.
+within it may still be far from any real one.
 """
 
 import math
@@ -73,10 +73,6 @@ class DispersionBasis:
     def index(self, coordinates: Tensor) -> Tensor:
         """Return the indices (..., W) of glasses at coordinates (..., C)."""
         return self.offset + coordinates @ self.slopes
-
-    def derivative(self, coordinates: Tensor) -> Tensor:
-        """Return ∂n/∂coordinates, (..., C, W): the same matrix for every glass, not copied."""
-        return self.slopes.expand(*coordinates.shape[:-1], *self.slopes.shape)
 
 
 def conrady_basis(wavelengths: Sequence[float], count: int = 3) -> DispersionBasis:
@@ -168,14 +164,6 @@ def nd_vd_deviation(coordinates: Sequence[float]) -> tuple[float, float, float]:
     return nd, (nd - 1.0) / spread, third / spread
 
 
-def coordinates_of(nd: float, vd: float, deviation: float = 0.0) -> tuple[float, float, float]:
-    """Return the coordinates of a glass with this nd, Vd and ΔPgF."""
-    spread = (nd - 1.0) / vd
-    values = (nd, spread, spread * deviation)
-    first, second, third = ((v - c) / u for v, c, u in zip(values, CENTRE, UNIT, strict=True))
-    return first, second, third
-
-
 def material_text(coordinates: Sequence[float]) -> str:
     """Return nd/Vd/ΔPgF as a prescription writes a glass, with every digit of the numbers."""
     nd, vd, deviation = nd_vd_deviation(coordinates)
@@ -217,27 +205,15 @@ class GlassRegion:
         """Return whether glasses (..., C) lie in the region, (...)."""
         return (self.excess(coordinates) <= tolerance).all(-1)
 
-    def hinges(self, coordinates: Tensor, margin: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Return max(0, A x - b - margin), (..., F), and its derivative, (..., F, C).
+    def hinges(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
+        """Return max(0, A x - b), (..., F), and its derivative, (..., F, C): as residuals, a row a
+        face, they keep a glass in the region.
 
         On a face the derivative is that beyond it, so that a first step meets a wall there.
-
-        As residuals, a row a face, they keep a glass in the region; a positive margin lets it go
-        that far beyond.
         """
-        excess = self.excess(coordinates) - margin
+        excess = self.excess(coordinates)
         leans = excess > -_ON_FACE
         return excess.clamp(min=0.0), leans[..., None] * self.normals
-
-    def penalty(self, coordinates: Tensor, margin: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Return the root of the sum of the squared hinges, (...), and its derivative, (..., C).
-
-        One residual a glass has the same square as all its hinges, and zero slope inside.
-        """
-        hinges, slopes = self.hinges(coordinates, margin)
-        size = hinges.norm(dim=-1)
-        direction = hinges / size.clamp(min=torch.finfo(size.dtype).tiny)[..., None]
-        return size, (direction[..., None] * slopes).sum(-2)
 
 
 def glass_region(coordinates: Tensor) -> GlassRegion:
@@ -269,34 +245,17 @@ def glass_region(coordinates: Tensor) -> GlassRegion:
     return GlassRegion(normals.to(coordinates), bounds.to(coordinates))
 
 
-def pull(coordinates: Tensor, glasses: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the vectors from the nearest of the glasses, (..., C), and its number, (...).
-
-    As residuals their derivative is the identity, as long as the nearest glass stays the same.
-
-    Args:
-        coordinates: (..., C) of continuous glasses.
-        glasses: (K, C).
-    """
-    number = nearest(coordinates, glasses, 1)[1][..., 0]
-    return coordinates - glasses[number], number
-
-
-def nearest(
-    coordinates: Tensor, glasses: Tensor, count: int, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def nearest(coordinates: Tensor, glasses: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return distances to the nearest glasses and their numbers, both (..., count), nearest first.
 
     Args:
         coordinates: (..., C) of continuous glasses.
         glasses: (K, C).
         count: how many; all K where there are no more.
-        weights: (C,) of the coordinates in the distance; by default 1.
     """
-    scale = torch.ones_like(glasses[0]) if weights is None else weights.to(glasses)
-    flat = (coordinates * scale).reshape(-1, glasses.shape[1])
+    flat = coordinates.reshape(-1, glasses.shape[1])
     # No matrix product: its rounding would blur the zero distance of a glass to itself.
-    distances = torch.cdist(flat, glasses * scale, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = torch.cdist(flat, glasses, compute_mode="donot_use_mm_for_euclid_dist")
     found = distances.topk(min(count, glasses.shape[0]), largest=False)
     shape = (*coordinates.shape[:-1], found.indices.shape[-1])
     return found.values.reshape(shape), found.indices.reshape(shape)

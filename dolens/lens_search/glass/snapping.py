@@ -58,7 +58,6 @@ def snap_glasses(
     reoptimise: Reoptimise,
     settings: SnapSettings | None = None,
     cost: Tensor | None = None,
-    weights: Tensor | None = None,
 ) -> Snapped:
     """Return lenses with catalogue glasses in place of their continuous ones.
 
@@ -69,7 +68,6 @@ def snap_glasses(
         reoptimise: optimises a batch of trials, each from where it stands.
         settings: how many trials are made.
         cost: (K,), added to the merit for each glass of a lens; a free glass counts as the nearest.
-        weights: (C,), of the coordinates in the distance of two glasses.
 
     Raises:
         InputError: there are no glasses, or two lenses have one number.
@@ -78,7 +76,7 @@ def snap_glasses(
         raise InputError("snapping: there is no glass to choose from")
     if len(start.lens.unique()) < len(start.lens):
         raise InputError("snapping: two lenses have the same number")
-    work = TrialGlasses(glasses, reoptimise, settings or SnapSettings(), cost, weights)
+    work = TrialGlasses(glasses, reoptimise, settings or SnapSettings(), cost)
     continuous = designs = best_of_each_lens(work.optimised(start), 1)
     far = work.optimised(unseen(work.far_glasses(designs), set()))
     while bool((designs.trials.numbers < 0).any()):

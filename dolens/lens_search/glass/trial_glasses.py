@@ -200,14 +200,12 @@ class TrialGlasses:
         reoptimise: Reoptimise,
         settings: SnapSettings,
         cost: Tensor | None = None,
-        weights: Tensor | None = None,
     ) -> None:
         """See `dolens.lens_search.glass.snapping.snap_glasses` for what is given."""
         self._glasses = glasses
         self._reoptimise = reoptimise
         self.settings = settings
         self._cost = torch.zeros_like(glasses[:, 0]) if cost is None else cost.to(glasses)
-        self._weights = weights
         self.count = 0
 
     def optimised(self, trials: GlassTrials) -> Designs:
@@ -243,8 +241,7 @@ class TrialGlasses:
         """
         shift = self._glasses - points[:, :, None]
         if model is None:
-            scaled = shift if self._weights is None else shift * self._weights
-            return (scaled**2).sum(-1)
+            return (shift**2).sum(-1)
         rise = 2.0 * torch.einsum("tpkc,tpc->tpk", shift, model.slopes)
         return rise + torch.einsum("tpkc,tpcd,tpkd->tpk", shift, model.curvatures, shift)
 
@@ -291,8 +288,8 @@ class TrialGlasses:
             count + int(bool((designs.trials.numbers[rows, slots] >= 0).all())), len(self._glasses)
         )
         if designs.model is None:
-            return nearest(points, self._glasses, count, self._weights)[1]
-        close = nearest(points, self._glasses, (count + 1) // 2, self._weights)[1]
+            return nearest(points, self._glasses, count)[1]
+        close = nearest(points, self._glasses, (count + 1) // 2)[1]
         model = GlassModel(*(part[rows, slots] for part in designs.model))
         rise = self._rises(points, model)
         total = (designs.merit[:, None, None] ** 2 + rise).clamp(min=0.0).sqrt() + self._cost

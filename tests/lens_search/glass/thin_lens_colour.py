@@ -65,7 +65,7 @@ def reoptimise(glasses, calls=None, iterations=40, wall=100.0, modelled=True):
         value = torch.cat([colour, wall * (hinges * free[..., None]).flatten(1)], dim=1)
         (t, g, c), w = x.shape, n.shape[-1]
         by_x = matrix.new_zeros(t, colour.shape[1], g, c)
-        by_x[:, :w] = torch.einsum("tgcw,tg,tg->twgc", glasses.basis.derivative(x), kappa, every)
+        by_x[:, :w] = torch.einsum("cw,tg,tg->twgc", glasses.basis.slopes, kappa, every)
         by_x = by_x.flatten(2) / POWER
         column_space = torch.linalg.qr(matrix)[0]
         by_x = by_x - column_space @ (column_space.transpose(1, 2) @ by_x)
