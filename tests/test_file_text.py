@@ -12,9 +12,9 @@ from dolens.cli.app import app
 from dolens.experiments.data.package_photographs import read_manifest
 from dolens.experiments.lens_search.rungs import forms_of_run
 from dolens.files import read_file
-from dolens.lens_page.offenders import _read as read_tolerances
 from dolens.optics.glass_catalog import find_glass, glass_folders
 from dolens.prescriptions.files import check_file
+from dolens.tolerancing import read_tolerance_file
 
 UNREADABLE = {
     "pipe": "is a pipe, no ",
@@ -65,7 +65,7 @@ def read_glass(path):
 READERS = {
     "a lens in Zemax's format": (".zmx", load_lens),
     "a lens in YAML": (".yaml", load_lens),
-    "tolerances": (".yaml", lambda path: read_tolerances(load_lens("asphere"), path, [])),
+    "tolerances": (".yaml", lambda path: read_tolerance_file(load_lens("asphere"), path)),
     "a manifest of photographs": (".csv", read_manifest),
     "anything": ("", lambda path: read_file(path, 100)),
 }

@@ -1,20 +1,8 @@
 """The worst offenders among a lens's tolerances, for its page.
 
-A file of tolerances is YAML::
-
-    elements:                     # optional, as in a lens file: groups that tilt and move
-      front: {surfaces: [1, 2]}
-    tolerances:                   # as experiment=cooke_sensitivity has them
-      elements.*.tilt_[xy]: 0.05                              # half-ranges: degrees,
-      elements.*.decenter_[xy]: {half_range: 0.02}            # mm,
-      surfaces.*.curvature: {half_range: 0.001, relative: true}    # or shares of the value
-    tolerance_factor: 1           # optional; multiplies all of them
-
-An experiment's file does as well: its `lens.elements` and `tolerances` are read.  Without a file,
-they are the usual ones of `dolens.tolerancing.tolerances`.
+They are those of a file (see `dolens.tolerancing.read_tolerance_file`), or the usual ones.
 """
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,19 +11,17 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import Conditions
-from dolens.errors import InputError, check_keys
+from dolens.errors import InputError
 from dolens.lens_page.tables import Table, number
 from dolens.optics.lens import Lens
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
-from dolens.prescriptions.files import read_yaml_file
-from dolens.prescriptions.numbers import require_mapping
-from dolens.prescriptions.row_data import elements_from
 from dolens.tolerancing import (
     Contributions,
     Sensitivities,
     Tolerances,
     contributions,
     linear_spots_over_field,
+    read_tolerance_file,
     sensitivities,
     tolerances_from,
     usual_tolerances,
@@ -45,8 +31,6 @@ from dolens.tolerancing import (
 
 DEFAULT = "default"
 _MOST = 12
-# `drawing` is what `dolens export` writes on drawings besides.
-_OWN_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
 
 
 @dataclass(frozen=True)
@@ -120,7 +104,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         lens: as designed, in double precision; it stays as it is.
         where: fields, which are taken on both sides of the axis in x and in y, and wavelengths,
             with their weights.
-        source: `default`, or a YAML file; see the module.
+        source: `default`, or a YAML file; see `read_tolerance_file`.
 
     Raises:
         InputError: the file cannot be read or names what the lens does not have, or no light of
@@ -133,8 +117,14 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         given, factor = usual_tolerances(lens), 1.0
         notes.append(usual_tolerances_text(lens))
     else:
-        lens = copy.deepcopy(lens).requires_grad_(True)
-        given, factor = _read(lens, Path(source), notes)
+        lens, content, unread = read_tolerance_file(lens, source)
+        if "tolerances" not in content:
+            raise InputError(f"{source}: 'tolerances' is missing")
+        given, factor = content["tolerances"], content.get("tolerance_factor", 1.0)
+        name = Path(source).name
+        if unread:
+            notes.append(f"Not read from {name}: {', '.join(unread)}.")
+        notes.append(f"Tolerances of {name}.")
     tolerances = tolerances_from(lens, given, factor)
     model, weights = linear_spots_over_field(lens, where, tolerances.names)
     return Offenders(
@@ -143,27 +133,3 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         contributions(model, tolerances, weights),
         notes,
     )
-
-
-def _read(lens: Lens, path: Path, notes: list[str]) -> tuple[Mapping[str, Any], Any]:
-    """Return the tolerances of a file and their factor; the lens gets the file's elements."""
-    content = read_yaml_file(path, "file of tolerances", "--tolerances")
-    require_mapping(content, str(path))
-    elements = content.get("elements")
-    if "defaults" in content:
-        # An experiment's file: it also says how its own run is done.
-        own = content.get("lens")
-        if isinstance(own, Mapping):
-            elements = own.get("elements")
-        unread = [str(key) for key in content if key not in (*_OWN_KEYS, "defaults", "lens")]
-        if unread:
-            notes.append(f"Not read from {path.name}: {', '.join(unread)}.")
-    else:
-        check_keys(content, _OWN_KEYS, str(path))
-    if "tolerances" not in content:
-        raise InputError(f"{path}: 'tolerances' is missing")
-    if elements is not None:
-        for name, element in elements_from(elements, lens.dtype, str(path)).items():
-            lens.elements[name] = element
-    notes.append(f"Tolerances of {path.name}.")
-    return content["tolerances"], content.get("tolerance_factor", 1.0)

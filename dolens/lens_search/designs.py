@@ -11,6 +11,7 @@ from dolens.lens_search.arrangement import AIR, STOP, Arrangement, asphere
 from dolens.lens_search.form_coordinates import ZONES, FormArrays, departures, form_coordinates
 from dolens.lens_search.forms import TOLERANCE, form_numbers
 from dolens.lens_search.glass.glass_merit import with_glasses_of
+from dolens.lens_search.growth import Grown
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import LensNumbers
 from dolens.lens_search.real_pupils import stop_radii, with_real_beams
@@ -38,6 +39,18 @@ class Designs:
     violation: Tensor
     starts: Tensor
     history: tuple[tuple[str, ...], ...]
+
+    @staticmethod
+    def of(
+        arrangement: Arrangement,
+        grown: Grown,
+        starts: Tensor,
+        history: Sequence[tuple[str, ...]],
+    ) -> "Designs":
+        """Return lenses that have grown as designs, with the numbers of their starts (n,)."""
+        return Designs(
+            arrangement, grown.values, grown.spots, grown.violation, starts, tuple(history)
+        )
 
     @property
     def merit(self) -> Tensor:

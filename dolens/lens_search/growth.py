@@ -82,7 +82,6 @@ class Grown:
         spots: RMS spot radii, mm, (n, F).
         violation: (n,), by how much the worst operand fails, relative or over the focal length.
         iterations: of all lenses together.
-        survivors: lenses after each stage, the starts first.
     """
 
     values: Tensor
@@ -90,12 +89,17 @@ class Grown:
     spots: Tensor
     violation: Tensor
     iterations: int
-    survivors: tuple[int, ...]
 
     @property
     def merit(self) -> Tensor:
         """Return the mean of the RMS spot radii over the fields, mm, (n,)."""
         return self.spots.mean(-1)
+
+    def best(self, share: float) -> "Grown":
+        """Return the better part of the lenses."""
+        order = self.merit.argsort()[: max(1, round(share * len(self.values)))]
+        parts = (part[order] for part in (self.values, self.starts, self.spots, self.violation))
+        return Grown(*parts, self.iterations)
 
 
 def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -> Grown:
@@ -107,7 +111,7 @@ def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -
         stages: in their order.
     """
     values, numbers = starts, torch.arange(len(starts))
-    survivors, iterations = [len(starts)], 0
+    iterations = 0
     before = stages[0]
     for stage in stages:
         found = _at_stage(merit, values, before, stage)
@@ -116,8 +120,7 @@ def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -
         best = found.merit.argsort()[: max(1, round(stage.kept * len(values)))]
         best = best[torch.isfinite(found.merit[best])]
         values, numbers = found.values[best], numbers[best]
-        survivors.append(len(values))
-    return _described(merit, values, numbers, iterations, survivors)
+    return _described(merit, values, numbers, iterations)
 
 
 def _at_stage(merit: SearchMerit, starts: Tensor, before: Stage, stage: Stage) -> BatchResult:
@@ -192,7 +195,7 @@ def finish(
     """
     done = settled(merit, grown.values, rounds, iterations, tolerance)
     used = grown.iterations + done.iterations
-    return _described(done.merit, done.values, grown.starts, used, grown.survivors, done.conditions)
+    return _described(done.merit, done.values, grown.starts, used, done.conditions)
 
 
 @dataclass(frozen=True)
@@ -265,7 +268,6 @@ def _described(
     values: Tensor,
     starts: Tensor,
     iterations: int,
-    survivors: Sequence[int],
     conditions: Conditions | None = None,
 ) -> Grown:
     if conditions is None:
@@ -273,4 +275,4 @@ def _described(
     spots = merit.spots(values, conditions)
     deviations = merit.deviations(values, conditions)
     violation = torch.where(merit.is_limit, deviations.clamp(min=0.0), deviations.abs())
-    return Grown(values, starts, spots, violation.amax(-1), iterations, tuple(survivors))
+    return Grown(values, starts, spots, violation.amax(-1), iterations)

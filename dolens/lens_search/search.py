@@ -129,11 +129,9 @@ def grown_starts(specification: Specification, plan: SearchPlan, task: StartTask
     generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
     starts = random_starts(merit, count, generator, plan.drawn)
     grown = grow(merit, starts, plan.stages)
-    done = _finished(merit, plan, _best(grown, plan.finished))
+    done = _finished(merit, plan, grown)
     history = (("start",),) * len(done.values)
-    designs = Designs(
-        arrangement, done.values, done.spots, done.violation, first + done.starts, history
-    )
+    designs = Designs.of(arrangement, done, first + done.starts, history)
     features = element_powers(arrangement, starts, merit)
     return Step((designs.keeping(plan.tolerance),), features, first, done.iterations)
 
@@ -160,21 +158,14 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
         values = torch.cat([part[0] for part in made])
         of = torch.cat([part[1] for part in made])
         all_words = [part[2] for part in made for _ in range(len(part[0]))]
-        done = _finished(merit, plan, _best(grow(merit, values, plan.stages[-2:]), plan.finished))
+        done = _finished(merit, plan, grow(merit, values, plan.stages[-2:]))
         iterations += done.iterations
         parent = of[done.starts].tolist()
         history = tuple(
             (*parents.history[p], all_words[row])
             for p, row in zip(parent, done.starts.tolist(), strict=True)
         )
-        designs = Designs(
-            arrangement,
-            done.values,
-            done.spots,
-            done.violation,
-            parents.starts[of[done.starts]],
-            history,
-        )
+        designs = Designs.of(arrangement, done, parents.starts[of[done.starts]], history)
         found.append(designs.keeping(plan.tolerance))
     none = torch.zeros((0, specification.elements), dtype=torch.float64)
     return Step(tuple(found), none, 0, iterations)
@@ -184,11 +175,11 @@ def real_glasses(specification: Specification, plan: SearchPlan, form: Designs) 
     """Give one form catalogue glasses, and finish what comes of it."""
     merit = merit_of(form.arrangement, specification, plan.rings, plan.arms)
     assert isinstance(merit, GlassMerit)  # glasses are chosen
-    found = with_real_glasses(
+    designs, continuous, iterations = with_real_glasses(
         merit, plan.glass, form, plan.finish_rounds, plan.finish_iterations, plan.tolerance
     )
     none = torch.zeros((0, specification.elements), dtype=torch.float64)
-    return Step((found.designs,), none, 0, found.iterations, found.continuous)
+    return Step((designs,), none, 0, iterations, continuous)
 
 
 def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -> Iterator[Step]:
@@ -242,18 +233,7 @@ def with_step(
     return pool
 
 
-def _best(grown: Grown, share: float) -> Grown:
-    """Return the better part of grown lenses."""
-    order = grown.merit.argsort()[: max(1, round(share * len(grown.values)))]
-    return Grown(
-        grown.values[order],
-        grown.starts[order],
-        grown.spots[order],
-        grown.violation[order],
-        grown.iterations,
-        grown.survivors,
-    )
-
-
 def _finished(merit: SearchMerit, plan: SearchPlan, grown: Grown) -> Grown:
-    return finish(merit, grown, plan.finish_rounds, plan.finish_iterations)
+    """Finish the better part of grown lenses."""
+    better = grown.best(plan.finished)
+    return finish(merit, better, plan.finish_rounds, plan.finish_iterations)

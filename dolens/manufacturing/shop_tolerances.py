@@ -6,10 +6,8 @@ from typing import Any
 
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
-from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.files import read_yaml_file
 from dolens.prescriptions.numbers import require_mapping
-from dolens.tolerancing.tolerances import Tolerances, tolerances_from
+from dolens.tolerancing.tolerances import Tolerances, read_tolerance_file, tolerances_from
 
 AGREE = "to be agreed"
 # What a drawing says that no ray trace needs, in ISO 10110's codes.
@@ -25,7 +23,6 @@ SHOP_KEYS = {
     "diameter": "diameter",
     "roughness": "roughness",
 }
-_FILE_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
 
 
 @dataclass(frozen=True)
@@ -61,39 +58,29 @@ class ShopTolerances:
 def read_tolerances(lens: Lens, path: str) -> tuple[Lens, ShopTolerances]:
     """Read tolerances for the drawings of a lens from a YAML file.
 
-    The file has `tolerances`, which map parameters to half-ranges as an experiment with tolerances
-    does (`conf/experiment/cooke_sensitivity.yaml` itself will do), `elements` with poses that may
-    be off, where the lens has none, and `drawing`, which maps the keys of `SHOP_KEYS` to text.
+    Args:
+        lens: stays as it is.
+        path: see `read_tolerance_file`; its `drawing` maps the keys of `SHOP_KEYS` to text.
 
     Returns:
-        The lens, with the file's elements where it had none, and the tolerances.
+        A lens with the file's elements, and the tolerances.
 
     Raises:
         InputError: one line that names the file and the key.
     """
-    data = read_yaml_file(path, "file of tolerances", "--tolerances")
-    if not isinstance(data, Mapping):
-        raise InputError(f"{path}: must map 'tolerances' to parameters and half-ranges")
-    if "defaults" in data:  # an experiment's file, whose other keys are the experiment's
-        require_mapping(data.get("lens") or {}, f"{path}: lens")
-        elements = (data.get("lens") or {}).get("elements")
-    else:
-        check_keys(data, _FILE_KEYS, str(path))
-        elements = data.get("elements")
-    if elements and not len(lens.elements):
-        rows = {**prescription_of(lens), "elements": elements}
-        lens = lens_from_prescription(rows, lens.dtype, where=str(path))
-    shop = data.get("drawing") or {}
+    drawn, content, _ = read_tolerance_file(lens, path)
+    shop = content.get("drawing") or {}
     require_mapping(shop, f"{path}: drawing")
     check_keys(shop, SHOP_KEYS, f"{path}: drawing")
     labels = {}
-    if data.get("tolerances"):
+    if content.get("tolerances"):
         try:
-            factor = data.get("tolerance_factor", 1.0)
-            labels = drawn_labels(tolerances_from(lens, data["tolerances"], factor))
+            factor = content.get("tolerance_factor", 1.0)
+            labels = drawn_labels(tolerances_from(drawn, content["tolerances"], factor))
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-    return lens, ShopTolerances(labels, {key: str(value) for key, value in shop.items()})
+    known = ShopTolerances(labels, {key: str(value) for key, value in shop.items()})
+    return drawn.requires_grad_(False), known
 
 
 def drawn_labels(tolerances: Tolerances) -> dict[str, tuple[float, str]]:

@@ -31,8 +31,11 @@ _SAME = 2e-3
 _FEW = 3
 
 
+Curves = Modulation | DiffractionModulation
+
+
 def modulation_figure(
-    mtf: Modulation | Mapping[str, Modulation],
+    mtf: Curves | Mapping[str, Curves],
     title: str | None = "Geometric MTF",
     labels: Sequence[str] | None = None,
 ) -> Figure:
@@ -78,7 +81,7 @@ def modulation_figure(
     return figure
 
 
-def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> dict[int, str]:
+def _draw(axes: Axes, mtf: Curves, names: Sequence[str] | None = None) -> dict[int, str]:
     """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
     frequency = mtf.frequencies.numpy()
     limit: dict[str, Any] = {
@@ -87,7 +90,9 @@ def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> di
         "linestyle": "--",
         "label": "diffraction limit",
     }
-    axes.plot(frequency, mtf.diffraction_limit.numpy(), **limit)
+    best = _limit(mtf)
+    if best is not None:
+        axes.plot(frequency, best, **limit)
     labels: dict[int, list[str]] = {}
     shades = ordered_colours(len(mtf.fields))
     for number, (field, colour) in enumerate(zip(mtf.fields, shades, strict=True)):
@@ -119,7 +124,7 @@ def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> di
     return {number: ", ".join(found) for number, found in labels.items()}
 
 
-def _alike(mtf: Modulation, one: int, other: int) -> bool:
+def _alike(mtf: Curves, one: int, other: int) -> bool:
     pairs = ((curve[one], curve[other]) for curve in (mtf.tangential, mtf.sagittal))
     return all(torch.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in pairs)
 
@@ -140,10 +145,10 @@ def modulation_comparison_figure(
     geometric: Modulation | None = None,
     title: str | None = "Modulation transfer function",
 ) -> Figure:
-    """Plot contrast against frequency, with diffraction at the left and of rays at the right.
+    """Plot contrast against frequency, with diffraction at the left and of rays at the right, as
+    `modulation_figure` does.
 
-    Tangential curves are solid and sagittal ones dashed, a colour a field.  The thin black curve is
-    the diffraction limit: at the left that of the field nearest to the axis, of its own pupil; at
+    The diffraction limit is at the left that of the field nearest to the axis, of its own pupil; at
     the right that of the paraxial circular pupil.
 
     Args:
@@ -154,60 +159,27 @@ def modulation_comparison_figure(
     Raises:
         InputError: neither is given.
     """
-    given = [curves for curves in (with_diffraction, geometric) if curves is not None]
-    if not given:
+    panels: dict[str, Curves] = {}
+    labels = None
+    if with_diffraction is not None:
+        name = "with diffraction"
+        known = with_diffraction.sampling_error[with_diffraction.sampling_error.isfinite()]
+        if len(known):
+            name += f", sampling error {number_text(float(known.max()), 1)}"
+        panels[name] = with_diffraction
+        waves = zip(with_diffraction.fields, with_diffraction.diffraction, strict=True)
+        labels = [
+            field_label(field, with_diffraction.field_unit) + ("" if by_waves else " (rays alone)")
+            for field, by_waves in waves
+        ]
+    if geometric is not None:
+        panels["rays (geometric)"] = geometric
+    if not panels:
         raise InputError("modulation_comparison_figure needs an MTF of one kind or the other")
-    figure = Figure(figsize=(PAGE if len(given) > 1 else 5.2, 3.7), layout="constrained")
-    grid = figure.subplots(1, len(given), squeeze=False, sharey=True)[0]
-    notes = [""] * len(given[0].fields)
-    for axes, curves in zip(grid, given, strict=True):
-        name = "rays (geometric)"
-        if isinstance(curves, DiffractionModulation):
-            name = "with diffraction"
-            known = curves.sampling_error[curves.sampling_error.isfinite()]
-            if len(known):
-                name += f", sampling error {number_text(float(known.max()), 1)}"
-            for number, diffraction in enumerate(curves.diffraction):
-                notes[number] = "" if diffraction else " (rays alone)"
-        _draw_comparison(axes, curves)
-        axes.set_title(name, fontsize=SMALL + 1)
-    dark = np.isnan(given[0].tangential[:, 0].numpy())
-    handles = [
-        Line2D([], [], color=colour, linewidth=1.6, label=label + note)
-        for colour, label, note in zip(
-            ordered_colours(len(notes)),
-            [field_label(field, given[0].field_unit) for field in given[0].fields],
-            [" (no light passes)" if no else note for no, note in zip(dark, notes, strict=True)],
-            strict=True,
-        )
-    ]
-    handles += [
-        Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
-        Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
-        Line2D([], [], color="black", linewidth=0.9, label="diffraction limit"),
-    ]
-    figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize=SMALL)
-    grid[0].set(ylim=(0.0, 1.02))
-    grid[0].set_ylabel("modulation", fontsize=SMALL + 1)
-    draw_title(figure, title)
-    return figure
+    return modulation_figure(panels, title, labels)
 
 
-def _draw_comparison(axes: Axes, curves: DiffractionModulation | Modulation) -> None:
-    frequency = curves.frequencies.numpy()
-    limit = _limit(curves)
-    if limit is not None:
-        axes.plot(frequency, limit, color="black", linewidth=0.9, gid="limit", zorder=2)
-    for number, colour in enumerate(ordered_colours(len(curves.fields))):
-        style: dict[str, Any] = {"color": colour, "linewidth": 1.5, "zorder": 3}
-        axes.plot(frequency, curves.tangential[number], gid="tangential", **style)
-        axes.plot(frequency, curves.sagittal[number], gid="sagittal", linestyle="--", **style)
-    axes.set_xlim(frequency.min(), frequency.max())
-    axes.set_xlabel("frequency (cycles/mm)", fontsize=SMALL + 1)
-    ruled_axes(axes)
-
-
-def _limit(curves: DiffractionModulation | Modulation) -> np.ndarray | None:
+def _limit(curves: Curves) -> np.ndarray | None:
     if isinstance(curves, Modulation):
         return curves.diffraction_limit.numpy()
     known = [

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from dolens.alignment.pose import Pose
 from dolens.experiments.poses.accuracy_tasks import Basin
@@ -167,6 +168,35 @@ def basin_figure(basin: Basin, name: str) -> Figure:
     bar.ax.tick_params(labelsize=SMALL)
     draw_title(figure, f"{name}\nfrom where a fit converges")
     return figure
+
+
+def draw_shares(
+    axes: Axes, labels: Sequence[str], errors: Sequence[Tensor], size: float = SMALL
+) -> None:
+    """Shade one bound and two, name the rows, and write how many errors of each lie within both.
+
+    Args:
+        axes: of errors over their bounds.
+        labels: of the rows, from above.
+        errors: over bounds, of each row.
+        size: of the text, points of 1/72 inch.
+    """
+    for times, shade in ((2.0, "0.93"), (1.0, "0.86")):
+        axes.axvspan(-times, times, color=shade, zorder=0)
+    for row, off in enumerate(errors):
+        shares = [100.0 * float((off.abs() < times).double().mean()) for times in (1.0, 2.0)]
+        axes.annotate(
+            f"{shares[0]:.0f} % | {shares[1]:.0f} %",
+            (1.01, row),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=size,
+        )
+    axes.annotate(
+        "within\n±1 | ±2", (1.01, 1.0), xycoords="axes fraction", va="bottom", fontsize=SMALL
+    )
+    axes.set_yticks(range(len(labels)), labels, fontsize=size)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
 
 
 def _start(name: str, units: dict[str, str]) -> str:

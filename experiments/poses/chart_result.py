@@ -11,6 +11,7 @@ from torch import Tensor
 from dolens.alignment.chart import MarkWindows
 from dolens.alignment.chart_fit import ChartFit
 from dolens.alignment.chart_model import BLUR, ChartModel
+from dolens.experiments.poses.accuracy_figures import draw_shares
 from dolens.experiments.poses.chart_restoration import ARMS, Judged
 from dolens.experiments.poses.pose_results import error_statistics
 from dolens.experiments.tables import Row
@@ -355,28 +356,13 @@ def coverage_figure(specimens: Sequence[FittedSpecimen], title: str) -> Figure:
     off = torch.stack([one.off for one in specimens])
     figure = Figure(figsize=(PAGE, 1.2 + 0.17 * len(names)), layout="constrained")
     axes = figure.add_subplot()
-    for times, shade in ((2.0, "0.93"), (1.0, "0.86")):
-        axes.axvspan(-times, times, color=shade, zorder=0)
     for row in range(len(names)):
         axes.plot(off[:, row], [row] * len(off), ".", color=colours(1)[0], markersize=4, alpha=0.6)
-        shares = [100.0 * float((off[:, row].abs() < t).double().mean()) for t in (1.0, 2.0)]
-        axes.annotate(
-            f"{shares[0]:.0f} % | {shares[1]:.0f} %",
-            (1.01, row),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            fontsize=SMALL - 1,
-        )
+    labels = [plain_text(parameter_label(name)) for name in names]
+    draw_shares(axes, labels, off.unbind(1), SMALL - 1)
     reach = max(3.2, 1.05 * float(off.abs().max()))
     axes.set_xlim(-reach, reach)
-    axes.set_yticks(
-        range(len(names)), [plain_text(parameter_label(n)) for n in names], fontsize=SMALL - 1
-    )
-    axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("error over standard error (no unit)", fontsize=SMALL + 1)
-    axes.annotate(
-        "within\n±1 | ±2", (1.01, 1.0), xycoords="axes fraction", va="bottom", fontsize=SMALL
-    )
     open_axes(axes)
     draw_title(figure, title)
     return figure

@@ -12,6 +12,7 @@ from torch import Tensor
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError, check_choice
 from dolens.experiments.experiment import Analysis, Figures
+from dolens.experiments.poses.accuracy_figures import draw_shares
 from dolens.experiments.poses.fitting import Estimates, probability
 from dolens.experiments.poses.misalignment import MisalignmentModule
 from dolens.experiments.poses.pose_results import error_statistics
@@ -236,10 +237,7 @@ def coverage_figure(
     """
     figure = Figure(figsize=(PAGE, 1.7 + 0.7 * len(errors)), layout="constrained")
     axes = figure.add_subplot()
-    for times, shade in ((2.0, "0.93"), (1.0, "0.86")):
-        axes.axvspan(-times, times, color=shade, zorder=0)
     for row, fits in enumerate(errors.values()):
-        every = torch.cat([off.flatten() for off in fits.values()]).abs()
         for fit, found in fits.items():
             off, place = found.flatten(), names.index(fit)
             level = row + 0.5 * ((place + 0.5) / len(names) - 0.5)
@@ -253,25 +251,10 @@ def coverage_figure(
                 alpha=0.6,
                 label=f"fit {fit}" if row == 0 else None,
             )
-        shares = [100.0 * float((every < times).double().mean()) for times in (1.0, 2.0)]
-        axes.annotate(
-            f"{shares[0]:.0f} % | {shares[1]:.0f} %",
-            (1.01, row),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            fontsize=SMALL,
-        )
+    together = [torch.cat([off.flatten() for off in fits.values()]) for fits in errors.values()]
+    draw_shares(axes, [case.replace("_", " ") for case in errors], together)
     axes.set_xscale("symlog", linthresh=3.0)
-    axes.set_yticks(range(len(errors)), [case.replace("_", " ") for case in errors])
-    axes.set_ylim(len(errors) - 0.5, -0.5)
     axes.set_xlabel("error over Cramér–Rao bound (no unit)", fontsize=SMALL + 1)
-    axes.annotate(
-        "within\n±1 | ±2",
-        (1.01, 1.0),
-        xycoords="axes fraction",
-        va="bottom",
-        fontsize=SMALL,
-    )
     draw_axes_title(axes, title)
     open_axes(axes)
     reach = max(abs(limit) for limit in axes.get_xlim())

@@ -66,24 +66,6 @@ class GlassPlan:
                 raise InputError(f"plan.glass.{name} must be 1 or more, not {getattr(self, name)}")
 
 
-@dataclass(frozen=True)
-class RealGlasses:
-    """What became of forms whose glasses were made real.
-
-    Attributes:
-        designs: with catalogue glasses.
-        continuous: least mean RMS spot with continuous glasses, mm: of the form itself, or of the
-            best of `designs` with its glasses set free again.
-        trials: lenses that were optimised.
-        iterations: of those that were finished.
-    """
-
-    designs: Designs
-    continuous: float
-    trials: int
-    iterations: int
-
-
 def with_real_glasses(
     merit: GlassMerit,
     plan: GlassPlan,
@@ -91,7 +73,7 @@ def with_real_glasses(
     rounds: int,
     iterations: int,
     tolerance: float,
-) -> RealGlasses:
+) -> tuple[Designs, float, int]:
     """Return a form with catalogue glasses, in several choices of these.
 
     Args:
@@ -101,6 +83,11 @@ def with_real_glasses(
         rounds: of finishing, see `finish`.
         iterations: of a round.
         tolerance: by how much an operand may fail.
+
+    Returns:
+        The designs; the least mean RMS spot with continuous glasses, mm: of the form itself, or of
+        the best of the designs with its glasses set free again; and the iterations of those that
+        were finished.
     """
     done = settled(merit, merit.freed(form.values), rounds, iterations)
     firm = done.merit
@@ -119,24 +106,18 @@ def with_real_glasses(
     u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)
     held = merit.held()
     none = torch.zeros(len(u), dtype=torch.float64)
-    grown = Grown(u, torch.arange(len(u)), none, none, 0, ())
+    grown = Grown(u, torch.arange(len(u)), none, none, 0)
     last = finish(held, grown, rounds, iterations)
     history = (*form.history[0], "glasses")
-    designs = Designs(
-        form.arrangement,
-        last.values,
-        last.spots,
-        last.violation,
-        form.starts.expand(len(u)),
-        (history,) * len(u),
-    ).keeping(tolerance)
+    starts, histories = form.starts.expand(len(u)), (history,) * len(u)
+    designs = Designs.of(form.arrangement, last, starts, histories).keeping(tolerance)
     designs = designs.chosen(designs.ranked_merit(merit).argsort(stable=True)[: plan.kept])
     used = done.iterations + last.iterations
     if len(designs.values):
         again = settled(merit, merit.freed(designs.values[:1]), rounds, iterations)
         spots = again.merit.spots(again.values, again.conditions).mean(-1)
         continuous, used = min(continuous, float(spots)), used + again.iterations
-    return RealGlasses(designs, continuous, found.trials, used)
+    return designs, continuous, used
 
 
 # A free glass this near to a wall leans on it, and a variable this near to a bound on that.

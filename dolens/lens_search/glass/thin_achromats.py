@@ -63,11 +63,6 @@ class ThinAchromats:
         """Return Σ|κ|, (P,): how strongly the elements are curved for their common power."""
         return self.total_curvatures.abs().sum(1)
 
-    @property
-    def spherochromatism(self) -> Tensor:
-        """Return S_I at the short wavelength less that at the long one, (P,)."""
-        return self.spherical[:, 0] - self.spherical[:, 2]
-
     def wavefront_error(self, focal_length: float, f_number: float) -> Tensor:
         """Return the rms wavefront error on the axis over the three wavelengths, mm, (P,).
 
