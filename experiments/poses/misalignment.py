@@ -1,13 +1,16 @@
 """Poses of a lens, fitted to images of point sources (Section VI)."""
 
 import copy
+import itertools
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from dolens.alignment.information import FisherInformation, fisher_information
@@ -15,7 +18,7 @@ from dolens.alignment.measurement import Light, Measurement
 from dolens.errors import check_choice
 from dolens.experiments.experiment import Experiment, Figures
 from dolens.experiments.poses.bench import Bench, Observations, check_precision, repetitions
-from dolens.experiments.poses.fit_plan import FitPlan, values_imager
+from dolens.experiments.poses.fit_plan import FitPlan, Stage, values_imager
 from dolens.experiments.poses.fitting import (
     Estimates,
     estimates,
@@ -25,7 +28,7 @@ from dolens.experiments.poses.fitting import (
     optimizer_of,
     slopes_of,
 )
-from dolens.experiments.poses.pose_figures import misalignment_figures
+from dolens.experiments.poses.pose_figures import image_labels, variable_label
 from dolens.experiments.poses.pose_results import (
     error_over_bound,
     history_row,
@@ -37,6 +40,9 @@ from dolens.experiments.poses.pose_results import (
 from dolens.experiments.tables import Row, write_table
 from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
+from dolens.plotting.layout import lens_title
+from dolens.plotting.parameter_fits import convergence_figure, corner_figure
+from dolens.plotting.pictures import spot_fit_figure
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.tasks import TaskMap
 from dolens.tasks import stage as named_stage
@@ -288,8 +294,16 @@ class MisalignmentModule(Experiment):
             return self.poses[number].images(self.finest(number), scaled)
 
     def figures(self) -> Figures:
-        """Return images before and after, the convergence of each fit, and bounds of its pose."""
-        return misalignment_figures(self)
+        """Return `spots`, and for each fit `convergence_<fit>` and `corner_<fit>`.
+
+        A fit that made no iteration has no convergence.
+        """
+        figures = {"spots": partial(_spots, self)}
+        for number, fit in enumerate(self.fits):
+            if any(row["fit"] == fit.name for row in self.history):
+                figures[f"convergence_{fit.name}"] = partial(_convergence, self, number)
+            figures[f"corner_{fit.name}"] = partial(_corner_of_fit, self, number)
+        return figures
 
     def summary(self) -> dict[str, float]:
         """Return what the run cost, and errors over bounds where the truth is known."""
@@ -318,3 +332,85 @@ class MisalignmentModule(Experiment):
             "fits": {fit.name: list(fit.variables) for fit in self.fits},
             "stages": [[stage.optimizer, stage.iterations] for stage in self.stages],
         }
+
+
+_LOSS_LABELS = {"s21": "loss S21 (no unit)", "noise_weighted": "χ² per pixel (no unit)"}
+
+
+def _spots(fitted: MisalignmentModule) -> Figure:
+    measured, initial, final, labels = [], [], [], []
+    for number, fit in enumerate(fitted.fits):
+        measurement = fitted.measurement(number)
+        shares = measurement.shares
+        measured.append(shares)
+        for kept, scaled in ((initial, fitted.initial[number]), (final, None)):
+            images = enumerate(fitted.images(number, scaled))
+            kept.append(torch.stack([measurement.as_seen(image, s)[0] for s, image in images]))
+        pose = fitted.poses[number]
+        labels += [f"fit {fit.name}{of}" for of in image_labels(len(pose.sources), pose.planes)]
+    return spot_fit_figure(
+        torch.cat(measured),
+        torch.cat(initial),
+        torch.cat(final),
+        labels,
+        fitted.sensor.pixel_pitch,
+        f"{lens_title(fitted.lens)}\nimages of point sources, measured and modelled",
+    )
+
+
+def _convergence(fitted: MisalignmentModule, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    rows = [row for row in fitted.history if row["fit"] == fit.name]
+    stages = [
+        (optimizer, len(list(group)))
+        for (_, optimizer), group in itertools.groupby(
+            rows, key=lambda row: (row["stage"], row["optimizer"])
+        )
+    ]
+    values = {
+        variable_label(name): ([float(row[name]) for row in rows], unit)
+        for name, unit in zip(pose.names, pose.unit_names, strict=True)
+    }
+    truth = fitted.truth(number)
+    return convergence_figure(
+        _losses(fitted.stages, rows),
+        values,
+        stages,
+        {variable_label(name): truth[name] for name in pose.names if name in truth},
+        f"{lens_title(fitted.lens)}\nconvergence of fit {fit.name}",
+    )
+
+
+def _losses(stages: Sequence[Stage], rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Return the losses by name, NaN in stages of another one."""
+    # Stages count from 1 in the history.
+    of_stage = [str(stages[int(row["stage"]) - 1].loss) for row in rows]
+    found = [float(row["loss"]) for row in rows]
+    return {
+        _LOSS_LABELS.get(name, name): [
+            value if own == name else math.nan for value, own in zip(found, of_stage, strict=True)
+        ]
+        for name in dict.fromkeys(of_stage)
+    }
+
+
+def _corner_of_fit(fitted: MisalignmentModule, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    units = pose.units.cpu()
+    covariance = fitted.information[fit.name].covariance.cpu() / torch.outer(units, units)
+    found = torch.tensor([pose.file_values()[name] for name in pose.names], dtype=torch.float64)
+    truth = fitted.truth(number)
+    true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
+    estimates = fitted.estimates.get(fit.name)
+    points = None if estimates is None else estimates.values
+    # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
+    about_truth = points is not None and bool(true.isfinite().all())
+    return corner_figure(
+        covariance,
+        [variable_label(name) for name in pose.names],
+        pose.unit_names,
+        true if about_truth else found,
+        points,
+        true if truth else None,
+        f"{lens_title(fitted.lens)}\nhow well fit {fit.name} knows its pose (Cramér–Rao)",
+    )
