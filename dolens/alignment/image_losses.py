@@ -3,7 +3,6 @@ pixels by their noise and so reaches the Cramér–Rao bound.
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,26 +14,6 @@ from dolens.errors import InputError
 from dolens.optics.autograd import forward_columns
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.rendering.spot_image import SpotImager
-
-
-class ImageLoss(Protocol):
-    """Computes a sum of squares that is small where a pose explains what a sensor saw."""
-
-    def weighted_at(self, pose: Pose) -> "ImageLoss":
-        """Return the loss with the weights of an iteration that begins at the pose."""
-        ...
-
-    def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
-        """Return r (rows,), at the pose or at another point u (P,)."""
-        ...
-
-    def terms(self, residuals: Tensor) -> dict[str, Tensor]:
-        """Return parts of |r|² by name."""
-        ...
-
-    def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -100,46 +79,6 @@ class SpotLoss:
         By forward mode: memory for one column at a time.
         """
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
-
-
-class ImageResiduals:
-    """Holds the residuals at the variables' values, as `DampedLeastSquares` takes them."""
-
-    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
-        self._loss, self._pose, self._chosen = loss, pose, chosen
-        self.point = pose.scaled.detach().clone()
-        with torch.no_grad():
-            self.residuals = loss.residuals(pose)
-
-    def sum_of_squares(self) -> float:
-        """Return ε."""
-        return float(self.residuals.square().sum())
-
-    def linear_model(self) -> LinearModel:
-        """Return R and b of the chosen variables."""
-        with torch.no_grad():
-            return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))
-
-
-class ImageMerit:
-    """Evaluates the residuals wherever the variables are, as a closure; the last point's are kept.
-
-    Args:
-        loss: what is to be small.
-        pose: whose variables move.
-        chosen: (P,), bool: those that may.
-    """
-
-    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
-        self._of = (loss, pose, chosen)
-        self._last: ImageResiduals | None = None
-
-    def __call__(self) -> ImageResiduals:
-        """Return the residuals where the variables are."""
-        point = self._of[1].scaled.detach()
-        if self._last is None or not torch.equal(self._last.point, point):
-            self._last = ImageResiduals(*self._of)
-        return self._last
 
 
 @dataclass(frozen=True)
@@ -227,6 +166,49 @@ class NoiseWeightedLoss:
         if self.deviation is None:
             return self.weighted_at(pose).jacobian(pose, chosen)
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
+
+
+ImageLoss = SpotLoss | NoiseWeightedLoss
+
+
+class ImageResiduals:
+    """Holds the residuals at the variables' values, as `DampedLeastSquares` takes them."""
+
+    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
+        self._loss, self._pose, self._chosen = loss, pose, chosen
+        self.point = pose.scaled.detach().clone()
+        with torch.no_grad():
+            self.residuals = loss.residuals(pose)
+
+    def sum_of_squares(self) -> float:
+        """Return ε."""
+        return float(self.residuals.square().sum())
+
+    def linear_model(self) -> LinearModel:
+        """Return R and b of the chosen variables."""
+        with torch.no_grad():
+            return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))
+
+
+class ImageMerit:
+    """Evaluates the residuals wherever the variables are, as a closure; the last point's are kept.
+
+    Args:
+        loss: what is to be small.
+        pose: whose variables move.
+        chosen: (P,), bool: those that may.
+    """
+
+    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
+        self._of = (loss, pose, chosen)
+        self._last: ImageResiduals | None = None
+
+    def __call__(self) -> ImageResiduals:
+        """Return the residuals where the variables are."""
+        point = self._of[1].scaled.detach()
+        if self._last is None or not torch.equal(self._last.point, point):
+            self._last = ImageResiduals(*self._of)
+        return self._last
 
 
 def spill_left(narrow: Tensor, wide: Tensor) -> Tensor:

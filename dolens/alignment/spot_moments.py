@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -43,56 +42,12 @@ _OF_A_RAY = 8
 _BY_REFERENCE = 1 << 18
 
 
-class SpotIntercepts(Protocol):
-    """Traces N fixed rays through lenses of which F parameters differ; no aperture clips them.
-
-    A ray that misses a surface or is reflected totally has an intercept that is finite, and means
-    nothing.
-    """
-
-    def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield ray intercepts of lenses with parameters (K, F), some lenses at a time.
-
-        Yields:
-            Which lenses; points (k, 2, N), mm; and which lenses lose a ray (k,).
-        """
-        ...
-
-    def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield ray intercepts with their derivatives, some lenses at a time.
-
-        Yields:
-            Which lenses; points (k, 2, N), mm; and derivatives (k, 2, F, N).
-        """
-        ...
-
-
-def spot_intercepts(lens: Lens, rays: Rays, names: Sequence[str]) -> SpotIntercepts:
-    """Return the ray intercepts of a lens as functions of its parameters.
-
-    The lenses are a `LensFamily`, which the kernels trace by one call; where they do not serve, a
-    batch of `torch.func.vmap` over the reference tracer, and the log says so.
-
-    Args:
-        lens: in double precision; its `backend` says what traces.
-        rays: N of them.
-        names: of F parameters, each a single number.
-
-    Raises:
-        InputError: no such parameter, or a backend that cannot serve.
-    """
-    opened = without_edges(lens)
-    ray = Components(*(c.double() for c in rays.components()))
-    own = Rays.from_components(ray, rays.wavelength)
-    if choose_backend(opened.system(), rays) == "reference":
-        return ReferenceIntercepts(opened, tuple(names), own)
-    wavelengths, shared = shared_rays(own)
-    return KernelIntercepts(LensFamily(opened, names, wavelengths), shared)
-
-
 @dataclass(frozen=True)
 class KernelIntercepts:
     """Traces a family of lenses by the kernels, which give derivatives of every ray.
+
+    A ray that misses a surface or is reflected totally has an intercept that is finite, and means
+    nothing.
 
     Attributes:
         family: of lenses whose apertures clip nothing.
@@ -103,13 +58,22 @@ class KernelIntercepts:
     rays: FamilyRays
 
     def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield what `SpotIntercepts.points` does."""
+        """Yield ray intercepts of lenses with parameters (K, F), some lenses at a time.
+
+        Yields:
+            Which lenses; points (k, 2, N), mm; and which lenses lose a ray (k,).
+        """
         size = self._lenses_at_a_time(_OF_A_RAY)
         for rows, points, arrive in intercept_parts(self.family, values, self.rays, size):
             yield rows, points.mT, ~arrive.all(-1)
 
     def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield what `SpotIntercepts.derivatives` does; both are zero of a ray that is lost."""
+        """Yield ray intercepts with their derivatives, some lenses at a time; both are zero of a
+        ray that is lost.
+
+        Yields:
+            Which lenses; points (k, 2, N), mm; and derivatives (k, 2, F, N).
+        """
         size = self._lenses_at_a_time(2 * (1 + self.family.count))
         for rows, found in jacobian_parts(self.family, values, self.rays, size):
             yield rows, found.values, found.derivatives
@@ -134,12 +98,12 @@ class ReferenceIntercepts:
     rays: Rays
 
     def points(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield what `SpotIntercepts.points` does."""
+        """Yield what `KernelIntercepts.points` does."""
         for rows, (points, arrive) in self._batches(self._land, values, 1):
             yield rows, points, ~arrive
 
     def derivatives(self, values: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield what `SpotIntercepts.derivatives` does."""
+        """Yield what `KernelIntercepts.derivatives` does."""
 
         def points_twice(row: Tensor) -> tuple[Tensor, Tensor]:
             points, _ = self._land(row)
@@ -171,6 +135,32 @@ class ReferenceIntercepts:
         """Return points (2, N), mm, and whether all rays arrive."""
         hit = traced_lens(self.lens, self.names, values, self.rays)
         return hit.position[:, :2].mT, arrives(hit.status).all()
+
+
+SpotIntercepts = KernelIntercepts | ReferenceIntercepts
+
+
+def spot_intercepts(lens: Lens, rays: Rays, names: Sequence[str]) -> SpotIntercepts:
+    """Return the ray intercepts of a lens as functions of its parameters.
+
+    The lenses are a `LensFamily`, which the kernels trace by one call; where they do not serve, a
+    batch of `torch.func.vmap` over the reference tracer, and the log says so.
+
+    Args:
+        lens: in double precision; its `backend` says what traces.
+        rays: N of them.
+        names: of F parameters, each a single number.
+
+    Raises:
+        InputError: no such parameter, or a backend that cannot serve.
+    """
+    opened = without_edges(lens)
+    ray = Components(*(c.double() for c in rays.components()))
+    own = Rays.from_components(ray, rays.wavelength)
+    if choose_backend(opened.system(), rays) == "reference":
+        return ReferenceIntercepts(opened, tuple(names), own)
+    wavelengths, shared = shared_rays(own)
+    return KernelIntercepts(LensFamily(opened, names, wavelengths), shared)
 
 
 @contextmanager
