@@ -15,7 +15,9 @@ from matplotlib.patches import Polygon
 from matplotlib.text import Text
 
 from dolens.manufacturing.drawing_numbers import (
+    AGREE,
     EQUATIONS,
+    ShopTolerances,
     clear_aperture_text,
     length,
     signed_radius,
@@ -32,7 +34,6 @@ from dolens.manufacturing.drawing_sheet import (
 )
 from dolens.manufacturing.element_sheet import element_sheet, section
 from dolens.manufacturing.glass_elements import GlassElement, face_of, glass_elements
-from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 from dolens.optics.elements import DISPLACEMENTS, TILTS
 from dolens.optics.lens import Lens
 from dolens.optics.text_tables import printable

@@ -6,6 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from dolens.manufacturing.drawing_numbers import (
+    AGREE,
+    ShopTolerances,
     clear_aperture_text,
     equation,
     is_aspheric,
@@ -30,7 +32,6 @@ from dolens.manufacturing.drawing_sheet import (
     table,
 )
 from dolens.manufacturing.glass_elements import Face, GlassElement
-from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 
 _SAMPLES = 201
 # Paper (mm) around the section that dimensions take: left and right, above and below.

@@ -11,13 +11,13 @@ from typing import Any
 
 from dolens.errors import InputError, check_choice
 from dolens.files import installed_version
+from dolens.manufacturing.drawing_numbers import ShopTolerances, read_tolerances
 from dolens.manufacturing.drawings import export_drawings
-from dolens.manufacturing.shop_tolerances import ShopTolerances, read_tolerances
 from dolens.manufacturing.solids import solids_figure
 from dolens.manufacturing.step import TOLERANCE_NM, StepResult, export_step
 from dolens.optics.lens import Lens
-from dolens.plotting.captions import plain_text
 from dolens.plotting.export import save_figure
+from dolens.plotting.style import plain_text
 from dolens.prescriptions.build import prescription_of
 from dolens.prescriptions.files import load_lens, save_lens
 

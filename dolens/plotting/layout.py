@@ -16,7 +16,6 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.system import OpticalSystem
-from dolens.plotting.captions import plain_text
 from dolens.plotting.section import (
     SAMPLES,
     Profile,
@@ -36,6 +35,7 @@ from dolens.plotting.style import (
     number_text,
     open_axes,
     ordered_colours,
+    plain_text,
     spectral_colour,
     with_minus,
 )

@@ -15,7 +15,6 @@ from dolens.errors import InputError
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
-from dolens.plotting.captions import caption
 from dolens.plotting.field_curves import scan_label
 from dolens.plotting.layout import (
     WIDTH,
@@ -29,6 +28,7 @@ from dolens.plotting.layout import (
 from dolens.plotting.style import (
     PAGE,
     SMALL,
+    caption,
     draw_axes_title,
     draw_title,
     legend_below,

@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.plotting.captions import plain_text
-from dolens.plotting.style import PAGE, SMALL, TITLE, draw_title, scale_bar
+from dolens.plotting.style import PAGE, SMALL, TITLE, draw_title, plain_text, scale_bar
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
 _SMALLEST, _LARGEST = 1.7, 3.2

@@ -14,7 +14,6 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.captions import plain_text
 from dolens.plotting.style import (
     PAGE,
     PALETTE,
@@ -24,6 +23,7 @@ from dolens.plotting.style import (
     legend_below,
     number_text,
     open_axes,
+    plain_text,
 )
 
 _CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.14

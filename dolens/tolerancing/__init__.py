@@ -1,15 +1,16 @@
 """This package predicts what manufacturing does to a lens: sensitivities, tolerances, yield."""
 
-from dolens.tolerancing.analysis import (
+from dolens.tolerancing.assembly import FocusTarget, assembled, best_focus, expected_spread
+from dolens.tolerancing.monte_carlo import (
     Outcome,
+    PerturbedSpots,
     ToleranceAnalysis,
     Yield,
     analyse_tolerances,
     quantiles,
     share_within,
+    trace_perturbed,
 )
-from dolens.tolerancing.assembly import FocusTarget, assembled, best_focus, expected_spread
-from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
 from dolens.tolerancing.sensitivity import (
     Contributions,
     FocusCurves,

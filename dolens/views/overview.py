@@ -116,7 +116,7 @@ def looked_at(
 
 def title_of(what: str, lens: Lens, given: Conditions) -> str:
     """Return the title of a figure: what it shows, of which lens, and at which conditions."""
-    from dolens.plotting.captions import caption
+    from dolens.plotting.style import caption
 
     return caption(what, lens, given.wavelengths, given.object_distance)
 

@@ -14,6 +14,7 @@ from dolens.experiments.camera.network_export import FORMATS as NETWORK_FORMATS
 from dolens.experiments.camera.network_export import export_onnx, export_torch, exportable
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
+from dolens.manufacturing.drawing_numbers import ShopTolerances, drawn_labels, read_tolerances
 from dolens.manufacturing.lens_export import FORMATS as LENS_FORMATS
 from dolens.manufacturing.lens_export import (
     Exported,
@@ -22,7 +23,6 @@ from dolens.manufacturing.lens_export import (
     program_name,
     write_record,
 )
-from dolens.manufacturing.shop_tolerances import ShopTolerances, drawn_labels, read_tolerances
 from dolens.manufacturing.step import TOLERANCE_NM
 from dolens.optics.lens import Lens
 from dolens.tolerancing import tolerances_from

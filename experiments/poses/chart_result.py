@@ -16,8 +16,7 @@ from dolens.experiments.poses.chart_restoration import ARMS, Judged
 from dolens.experiments.poses.pose_results import error_statistics
 from dolens.experiments.tables import Row
 from dolens.optics.parameter_names import DEGREE, unit_of
-from dolens.plotting.captions import plain_text
-from dolens.plotting.style import PAGE, SMALL, colours, draw_title, open_axes
+from dolens.plotting.style import PAGE, SMALL, colours, draw_title, open_axes, plain_text
 from dolens.rendering.psf import bin_rays
 
 # An interval of 95 % of a normal distribution.

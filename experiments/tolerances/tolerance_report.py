@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.tables import Row
-from dolens.plotting.captions import plain_text
+from dolens.plotting.style import plain_text
 from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,

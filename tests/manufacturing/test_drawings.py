@@ -14,9 +14,12 @@ from dolens import load_lens
 from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.manufacturing.drawing_numbers import (
+    AGREE,
+    ShopTolerances,
     coefficient_rows,
     material_rows,
     radius_text,
+    read_tolerances,
     sag_grid,
     sag_rows,
 )
@@ -25,7 +28,6 @@ from dolens.manufacturing.drawings import assembly_sheets, drawing_figures, expo
 from dolens.manufacturing.element_sheet import element_sheet
 from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.lens_export import export_lens_file
-from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances, read_tolerances
 from tests.lenses import lens_of_rows
 
 

@@ -12,16 +12,18 @@ from dolens.plotting import (
     before_after_figure,
     history_figure,
 )
-from dolens.plotting.captions import caption, plain_text, wavelengths_text
 from dolens.plotting.style import (
     TITLE,
+    caption,
     draw_axes_title,
     draw_title,
     legend_below,
     line_styles,
     log_ticks,
     number_text,
+    plain_text,
     value_and_error,
+    wavelengths_text,
     with_minus,
 )
 from tests.plotting.overlaps import flaws
