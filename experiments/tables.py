@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from dolens.errors import InputError
@@ -31,6 +31,13 @@ def write_table(path: Path, rows: Iterable[Row], digits: int | None = None) -> N
         writer.writeheader()
         for row in kept:
             writer.writerow({key: _written(value, digits) for key, value in row.items()})
+
+
+def markdown_table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table of Markdown; strokes of the cells are escaped."""
+    lines = (" | ".join(c.replace("|", r"\|") for c in cells) for cells in (heading, *rows))
+    first, *others = (f"| {line} |" for line in lines)
+    return [first, "|" + "---|" * len(heading), *others]
 
 
 def read_table(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:

@@ -98,8 +98,8 @@ class Grown:
     def best(self, share: float) -> "Grown":
         """Return the better part of the lenses."""
         order = self.merit.argsort()[: max(1, round(share * len(self.values)))]
-        parts = (part[order] for part in (self.values, self.starts, self.spots, self.violation))
-        return Grown(*parts, self.iterations)
+        values, starts = self.values[order], self.starts[order]
+        return Grown(values, starts, self.spots[order], self.violation[order], self.iterations)
 
 
 def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -> Grown:

@@ -167,11 +167,10 @@ def modulation_comparison_figure(
         if len(known):
             name += f", sampling error {number_text(float(known.max()), 1)}"
         panels[name] = with_diffraction
-        waves = zip(with_diffraction.fields, with_diffraction.diffraction, strict=True)
-        labels = [
-            field_label(field, with_diffraction.field_unit) + ("" if by_waves else " (rays alone)")
-            for field, by_waves in waves
-        ]
+        labels = [field_label(f, with_diffraction.field_unit) for f in with_diffraction.fields]
+        lit = ~with_diffraction.tangential[:, 0].isnan()
+        for number, by_waves in enumerate(with_diffraction.diffraction):
+            labels[number] += " (rays alone)" if lit[number] and not by_waves else ""
     if geometric is not None:
         panels["rays (geometric)"] = geometric
     if not panels:

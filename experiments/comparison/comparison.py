@@ -29,6 +29,7 @@ from dolens.experiments.comparison.rows import (
     value_of,
 )
 from dolens.experiments.comparison.runs import FoundRuns, Run, find_runs
+from dolens.experiments.tables import markdown_table
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
 from dolens.plotting.style import with_minus
 from dolens.reconstruction.quality import Interval
@@ -121,10 +122,11 @@ def compared(
 
 def markdown_of(comparison: Comparison) -> str:
     """Return the tables as Markdown."""
-    lines = [f"## {comparison.title()}", "", *_table(comparison.heading(), _cells(comparison))]
+    lines = [f"## {comparison.title()}", ""]
+    lines += markdown_table(comparison.heading(), _cells(comparison))
     if comparison.against is not None:
         lines += ["", f"Gains over row {comparison.against.number} ({comparison.against.label}):"]
-        lines += ["", *_table(GAIN_HEADING, gain_cells(comparison))]
+        lines += ["", *markdown_table(GAIN_HEADING, gain_cells(comparison))]
     for part in ([explanation(comparison)], [f"- {note}" for note in comparison.notes()]):
         lines += ["", *part] if any(part) else []
     return "\n".join(lines) + "\n"
@@ -267,15 +269,6 @@ def _point(row: Row, metric: str) -> RunPoint | None:
 
 def _cells(comparison: Comparison) -> list[list[str]]:
     return [comparison.cells(row) for row in comparison.rows.rows]
-
-
-def _table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = "|" + "---|" * len(heading)
-    return [_line(heading), rule, *map(_line, rows)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
 def _numbers(value: Value | None) -> tuple[Any, ...]:

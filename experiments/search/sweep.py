@@ -31,6 +31,7 @@ from dolens.experiments.search.search import (
 )
 from dolens.experiments.search.settings import MAXIMIZE, SearchSettings, directions_of
 from dolens.experiments.search.storage import JOURNAL
+from dolens.experiments.tables import markdown_table
 from dolens.plotting import SearchTrial, save_figure, search_history_figure, trade_off_figure
 
 logger = logging.getLogger(__name__)
@@ -198,13 +199,13 @@ def markdown_of(search: Search) -> str:
         ),
         *(_name(parameter) for parameter in parameters),
     ]
-    lines += ["", *_table(heading, rows)]
+    lines += ["", *markdown_table(heading, rows)]
     shares = importances(search)
     if shares:
         lines += ["", "How much each parameter tells the best tenth of the trials from the others:"]
         heading = ["objective", *(_name(parameter) for parameter in parameters)]
         rows = [[n, *(f"{of.get(p, 0.0):.0%}" for p in parameters)] for n, of in shares.items()]
-        lines += ["", *_table(heading, rows)]
+        lines += ["", *markdown_table(heading, rows)]
     pruned = [trial for trial in trials if outcome(trial) == PRUNED]
     if pruned:
         lines += ["", "Pruned:", "", *(f"- {t.number}: {t.user_attrs[PRUNED]}" for t in pruned)]
@@ -239,9 +240,3 @@ def _command(search: Search, trial: FrozenTrial) -> str:
 
 def _name(key: str) -> str:
     return key.lstrip("+")
-
-
-def _table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [heading, *rows]
-    shown = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in lines]
-    return [shown[0], "|" + "---|" * len(heading), *shown[1:]]
