@@ -3,7 +3,7 @@ aberrations, RMS spot radii and relative illumination.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,12 +70,44 @@ def field_curves_figure(
     grid[0, 1].set_title(f"Distortion from {ideal}, {reference:.4g} nm", fontsize=SMALL + 1)
     if rows[0].scan.field_unit != "°":
         grid[0, 1].set_title(f"Distortion, {reference:.4g} nm", fontsize=SMALL + 1)
-    handles = [
-        Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
-        Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
-        *wavelength_handles(rows[0].wavelengths),
-    ]
-    legend_below(figure, handles, 5)
+    legend_below(figure, [*_foci_handles(), *wavelength_handles(rows[0].wavelengths)], 5)
+    draw_title(figure, title)
+    return figure
+
+
+def states_field_curves_figure(
+    states: Mapping[str, FieldCurves], title: str | None = None
+) -> Figure:
+    """Plot field curvature above and distortion below, a column for every state, at one scale.
+
+    Tangential foci are solid and sagittal ones dashed, at the reference wavelength.
+
+    Args:
+        states: name → curves of the lens in that state.
+        title: above all.
+
+    Raises:
+        InputError: there are no states.
+    """
+    if not states:
+        raise InputError("states_field_curves_figure needs one state or more")
+    figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
+    grid = figure.subplots(2, len(states), squeeze=False, sharex="row")
+    labelled = ""
+    for (above, below), (name, curves) in zip(grid.T, states.items(), strict=True):
+        nearest = int((curves.wavelengths - curves.reference_wavelength).abs().argmin())
+        _foci(above, curves, [nearest])
+        _distortion(below, curves)
+        above.set_title(name, fontsize=SMALL + 1)
+        label = scan_label(curves.scan)
+        for axes in (above, below):
+            draw_field_limits(axes, curves.scan)
+            axes.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
+            axes.set_ylabel("" if label == labelled else label, fontsize=SMALL + 1)
+        labelled = label
+        above.set_xlabel("focus (mm)", fontsize=SMALL)
+        below.set_xlabel("distortion (%)", fontsize=SMALL)
+    legend_below(figure, _foci_handles(), 2)
     draw_title(figure, title)
     return figure
 
@@ -102,10 +134,16 @@ def note_if_empty(axes: Axes, values: np.ndarray, text: str) -> None:
         )
 
 
-def _foci(axes: Axes, curves: FieldCurves) -> None:
+def _foci_handles() -> list[Line2D]:
+    ways = (("tangential", "-"), ("sagittal", "--"))
+    return [Line2D([], [], color="0.25", linewidth=1.4, linestyle=s, label=w) for w, s in ways]
+
+
+def _foci(axes: Axes, curves: FieldCurves, wavelengths: Iterable[int] | None = None) -> None:
+    """Draw the foci, at wavelengths of some numbers or at all."""
     field = curves.scan.coordinate.numpy()
-    for number, wavelength in enumerate(curves.wavelengths):
-        colour = spectral_colour(float(wavelength))
+    for number in range(len(curves.wavelengths)) if wavelengths is None else wavelengths:
+        colour = spectral_colour(float(curves.wavelengths[number]))
         style: dict[str, Any] = {"color": colour, "linewidth": 1.4, "zorder": 3}
         axes.plot(curves.tangential[:, number], field, gid="tangential", **style)
         axes.plot(curves.sagittal[:, number], field, gid="sagittal", linestyle="--", **style)

@@ -3,19 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from dolens.analysis.field_curves import FieldCurves
 from dolens.errors import InputError
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
-from dolens.plotting.field_curves import scan_label
 from dolens.plotting.layout import (
     WIDTH,
     draw_layout,
@@ -26,14 +21,10 @@ from dolens.plotting.layout import (
     optics_text,
 )
 from dolens.plotting.style import (
-    PAGE,
     SMALL,
     caption,
     draw_axes_title,
     draw_title,
-    legend_below,
-    ruled_axes,
-    spectral_colour,
 )
 
 
@@ -197,55 +188,5 @@ def states_layout_figure(
         axes.set_title(f"{name}: {optics}", fontsize=SMALL + 1)
     for axes in grid[:-1]:
         axes.set_xlabel("")
-    draw_title(figure, title)
-    return figure
-
-
-def states_field_curves_figure(
-    states: Mapping[str, FieldCurves], title: str | None = None
-) -> Figure:
-    """Plot field curvature above and distortion below, a column for every state, at one scale.
-
-    Tangential foci are solid and sagittal ones dashed, at the reference wavelength.
-
-    Args:
-        states: name → curves of the lens in that state.
-        title: above all.
-
-    Raises:
-        InputError: there are no states.
-    """
-    if not states:
-        raise InputError("states_field_curves_figure needs one state or more")
-    figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
-    grid = figure.subplots(2, len(states), squeeze=False, sharex="row")
-    for column, (name, curves) in enumerate(states.items()):
-        number = int((curves.wavelengths - curves.reference_wavelength).abs().argmin())
-        field = curves.scan.coordinate.numpy()
-        style = {"color": spectral_colour(curves.reference_wavelength), "linewidth": 1.4}
-        above, below = grid[:, column]
-        above.plot(curves.tangential[:, number].numpy(), field, gid="tangential", **style)
-        above.plot(
-            curves.sagittal[:, number].numpy(), field, gid="sagittal", linestyle="--", **style
-        )
-        below.plot(curves.distortion.numpy(), field, gid="distortion", **style)
-        above.set_title(name, fontsize=SMALL + 1)
-        for axes in (above, below):
-            axes.set_ylim(float(np.min(field)), float(np.max(field)))
-            axes.axvline(0.0, color="0.6", linewidth=0.8, zorder=1)
-            axes.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
-            ruled_axes(axes)
-        above.set_xlabel("focus (mm)", fontsize=SMALL)
-        below.set_xlabel("distortion (%)", fontsize=SMALL)
-    labels = [scan_label(curves.scan) for curves in states.values()]
-    for column, label in enumerate(labels):
-        if column == 0 or label != labels[column - 1]:
-            for axes in grid[:, column]:
-                axes.set_ylabel(label, fontsize=SMALL + 1)
-    handles: Sequence[Line2D] = [
-        Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
-        Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
-    ]
-    legend_below(figure, handles, 2)
     draw_title(figure, title)
     return figure

@@ -35,6 +35,7 @@ _SQUEEZE = 1.4
 _BOTH_SIGNS, _POSITIVE = "RdBu_r", "Reds"
 # Two standard deviations of a share of n lenses, √(p·(1 - p)/n), are drawn as a band.
 _BAND = 2.0
+_SINGULAR = {"thicknesses.": "thickness ", "sources.": "source ", "planes.": "plane "}
 # A half-range as `Tolerances.label` writes it: number, and unit with the blank before it.
 _TOLERANCE = re.compile(r"± ([\d.e+-]+)(.*)")
 
@@ -215,15 +216,16 @@ def offenders_figure(
 
 
 def parameter_label(name: str) -> str:
-    """Return the label of a parameter in figures: `front tilt x`, `curvature 3`, `thickness 1`."""
+    """Return the label of a parameter in figures: `front tilt x`, `curvature 3`, `thickness 1`,
+    `source 0 z`, and `sources z` of all sources (`sources.*.z`).
+    """
     first, *rest = name.split(".")
-    if first == "elements":
-        return f"{rest[0]} {rest[1].replace('_', ' ')}"
     if first == "surfaces":
         return f"{rest[1]} {rest[0]}"
-    if first == "thicknesses":
-        return f"thickness {rest[0]}"
-    return name.replace("_", " ")
+    label = name.removeprefix("elements.").replace(".*.", " ")
+    for many, one in _SINGULAR.items():
+        label = label.replace(many, one)
+    return label.replace(".", " ").replace("_", " ")
 
 
 def tolerance_label(name: str, tolerance: str) -> str:

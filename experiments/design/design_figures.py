@@ -37,8 +37,9 @@ from dolens.plotting import (
     spots_comparison_figure,
     spots_figure,
 )
+from dolens.plotting.field_curves import states_field_curves_figure
 from dolens.plotting.layout import optics_text, shown_name
-from dolens.plotting.lens_section import states_field_curves_figure, states_layout_figure
+from dolens.plotting.lens_section import states_layout_figure
 from dolens.plotting.style import number_text
 
 _FREQUENCIES = 201

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from dolens.alignment.pose import Pose
 from dolens.experiments.poses.accuracy_tasks import Basin
-from dolens.experiments.poses.pose_figures import variable_label
 from dolens.experiments.tables import Row
 from dolens.plotting.style import (
     PAGE,
@@ -22,6 +21,7 @@ from dolens.plotting.style import (
     number_text,
     ruled_axes,
 )
+from dolens.plotting.tolerances import parameter_label
 from dolens.rendering.spot_image import SpotImager
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
@@ -74,7 +74,7 @@ def photons_figure(
             )
         axes.plot(counts, [r["bound"] for r in mine], color="0.3", linewidth=1.0, label="bound")
         axes.set(xscale="log", yscale="log")
-        axes.set_title(variable_label(name), fontsize=SMALL + 1)
+        axes.set_title(parameter_label(name), fontsize=SMALL + 1)
         axes.set_xlabel("photons of a source", fontsize=SMALL + 1)
         printed = "°" if unit == "deg" else unit
         axes.set_ylabel(f"error ({printed})", fontsize=SMALL + 1)
@@ -201,7 +201,7 @@ def draw_shares(
 
 def _start(name: str, units: dict[str, str]) -> str:
     unit = "°" if units[name] == "deg" else units[name]
-    return f"error of the start, {variable_label(name)} ({unit})"
+    return f"error of the start, {parameter_label(name)} ({unit})"
 
 
 def _write(axes: Axes, table: np.ndarray) -> None:

@@ -17,6 +17,7 @@ from dolens.experiments.poses.pose_results import error_statistics
 from dolens.experiments.tables import Row
 from dolens.optics.parameter_names import DEGREE, unit_of
 from dolens.plotting.style import PAGE, SMALL, colours, draw_title, open_axes, plain_text
+from dolens.plotting.tolerances import parameter_label
 from dolens.rendering.psf import bin_rays
 
 # An interval of 95 % of a normal distribution.
@@ -225,12 +226,6 @@ def gain_rows(specimens: Sequence[FittedSpecimen]) -> list[Row]:
 
 # Half the side of what is drawn of a mark, in widths of its spot.
 _SEEN = 4.0
-
-
-def parameter_label(name: str) -> str:
-    """Return a label for people: `front tilt x` of `elements.front.tilt_x`."""
-    short = name.removeprefix("elements.").replace("thicknesses.", "gap ")
-    return short.replace("planes.", "plane ").replace(".", " ").replace("_", " ")
 
 
 def marks_figure(

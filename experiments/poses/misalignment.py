@@ -28,7 +28,7 @@ from dolens.experiments.poses.fitting import (
     optimizer_of,
     slopes_of,
 )
-from dolens.experiments.poses.pose_figures import image_labels, variable_label
+from dolens.experiments.poses.pose_figures import image_labels
 from dolens.experiments.poses.pose_results import (
     error_over_bound,
     history_row,
@@ -43,6 +43,7 @@ from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.plotting.parameter_fits import convergence_figure, corner_figure
 from dolens.plotting.pictures import spot_fit_figure
+from dolens.plotting.tolerances import parameter_label
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.tasks import TaskMap
 from dolens.tasks import stage as named_stage
@@ -368,7 +369,7 @@ def _convergence(fitted: MisalignmentModule, number: int) -> Figure:
         )
     ]
     values = {
-        variable_label(name): ([float(row[name]) for row in rows], unit)
+        parameter_label(name): ([float(row[name]) for row in rows], unit)
         for name, unit in zip(pose.names, pose.unit_names, strict=True)
     }
     truth = fitted.truth(number)
@@ -376,7 +377,7 @@ def _convergence(fitted: MisalignmentModule, number: int) -> Figure:
         _losses(fitted.stages, rows),
         values,
         stages,
-        {variable_label(name): truth[name] for name in pose.names if name in truth},
+        {parameter_label(name): truth[name] for name in pose.names if name in truth},
         f"{lens_title(fitted.lens)}\nconvergence of fit {fit.name}",
     )
 
@@ -407,7 +408,7 @@ def _corner_of_fit(fitted: MisalignmentModule, number: int) -> Figure:
     about_truth = points is not None and bool(true.isfinite().all())
     return corner_figure(
         covariance,
-        [variable_label(name) for name in pose.names],
+        [parameter_label(name) for name in pose.names],
         pose.unit_names,
         true if about_truth else found,
         points,

@@ -29,17 +29,7 @@ from dolens.plotting.style import (
     number_text,
     ruled_axes,
 )
-
-
-def variable_label(name: str) -> str:
-    """Return a label for people.
-
-    `elements.lens.tilt_x` becomes `lens tilt x`, `sources.1.z` `source 1 z`, and `sources.*.z`
-    `sources z`.
-    """
-    short = name.removeprefix("elements.").replace("sources.*.", "sources ")
-    short = short.replace("sources.", "source ")
-    return short.replace(".", " ").replace("_", " ")
+from dolens.plotting.tolerances import parameter_label
 
 
 def image_labels(sources: int, planes: Sequence[float]) -> list[str]:
@@ -153,7 +143,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
                 markerfacecolor=colour if seen else "none",
             )
     labels = [
-        f"{variable_label(name)}\n(scale {scales[name]:g}{_unit(units[name])})" for name in names
+        f"{parameter_label(name)}\n(scale {scales[name]:g}{_unit(units[name])})" for name in names
     ]
     axes.set_yticks(range(len(names)), labels, fontsize=SMALL)
     axes.set_xscale("log")
@@ -214,7 +204,7 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
     axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     axes.set_xticks(
         range(len(names)),
-        [variable_label(n).replace(" ", "\n", 1) for n in names],
+        [parameter_label(n).replace(" ", "\n", 1) for n in names],
         fontsize=SMALL - 1,
     )
     axes.set_xlabel("parts of the eigenvector of largest variance (no unit)", fontsize=SMALL + 1)
@@ -228,7 +218,7 @@ def _corner_of_bounds(found: Arrangement, name: str) -> Figure:
     values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
     return corner_figure(
         found.information.covariance / torch.outer(units, units),
-        [variable_label(name) for name in found.pose.names],
+        [parameter_label(name) for name in found.pose.names],
         found.pose.unit_names,
         values,
         found.estimates,

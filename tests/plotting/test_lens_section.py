@@ -11,9 +11,9 @@ from dolens.plotting import (
     before_after_figure,
     layout_figure,
 )
+from dolens.plotting.field_curves import states_field_curves_figure
 from dolens.plotting.lens_section import (
     lens_section_figure,
-    states_field_curves_figure,
     states_layout_figure,
 )
 from dolens.prescriptions import lens_from_prescription

@@ -65,6 +65,8 @@ def test_bars_are_in_per_cent_and_micrometres_the_worst_on_top():
         ("surfaces.3.curvature", "curvature 3"),
         ("thicknesses.1", "thickness 1"),
         ("sensor_distance", "sensor distance"),
+        ("sources.1.z", "source 1 z"),
+        ("sources.*.x", "sources x"),
     ],
 )
 def test_parameters_in_words(name, label):
