@@ -13,8 +13,7 @@ from dolens.experiments.data.package_photographs import read_manifest
 from dolens.experiments.lens_search.rungs import forms_of_run
 from dolens.files import read_file
 from dolens.optics.glass_catalog import find_glass, glass_folders
-from dolens.prescriptions.files import check_file
-from dolens.tolerancing import read_tolerance_file
+from dolens.prescriptions.files import check_file, read_tolerance_file
 
 UNREADABLE = {
     "pipe": "is a pipe, no ",

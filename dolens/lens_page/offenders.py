@@ -1,6 +1,6 @@
 """The worst offenders among a lens's tolerances, for its page.
 
-They are those of a file (see `dolens.tolerancing.read_tolerance_file`), or the usual ones.
+They are those of a file (see `dolens.prescriptions.files.read_tolerance_file`), or the usual ones.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ from dolens.errors import InputError
 from dolens.lens_page.tables import Table, number
 from dolens.optics.lens import Lens
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
+from dolens.prescriptions.files import read_tolerance_file
 from dolens.tolerancing import (
     Contributions,
     Sensitivities,
     Tolerances,
     contributions,
     linear_spots_over_field,
-    read_tolerance_file,
     sensitivities,
     tolerances_from,
     usual_tolerances,

@@ -74,8 +74,8 @@ def write_page(
         wavelengths: nm; None for the lens's own.
         f_number: sets the stop; or
         entrance_pupil_diameter: mm, sets the stop.
-        tolerances: `default`, or a YAML file (see `dolens.tolerancing.read_tolerance_file`), adds
-            the worst offenders; None leaves them out.
+        tolerances: `default`, or a file of tolerances (see `dolens.prescriptions.files`), adds the
+            worst offenders; None leaves them out.
         figures: a folder that gets every figure as PNG and SVG.
         command: what made the page, for its heading.
 

@@ -19,8 +19,9 @@ from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Rectangle
 from dolens.optics.surfaces.conic import Conic
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
+from dolens.prescriptions.files import read_tolerance_file
 from dolens.prescriptions.numbers import require_mapping
-from dolens.tolerancing.tolerances import Tolerances, read_tolerance_file, tolerances_from
+from dolens.tolerancing.tolerances import Tolerances, tolerances_from
 
 AGREE = "to be agreed"
 # What a drawing says that no ray trace needs, in ISO 10110's codes.

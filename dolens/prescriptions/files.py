@@ -1,5 +1,6 @@
 """Lens files are read, written, and checked by the folder."""
 
+import copy
 import logging
 import os
 import re
@@ -11,14 +12,17 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError, did_you_mean, one_line
+from dolens.errors import InputError, check_keys, did_you_mean, one_line
 from dolens.files import packaged_configuration, read_file, resolved_path, written_whole
+from dolens.optics.elements import check_elements
 from dolens.optics.glass_catalog import glass_folders
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
+from dolens.prescriptions.numbers import require_mapping
 from dolens.prescriptions.other_programs import ReadPrescription
 from dolens.prescriptions.plain_values import plain_values
+from dolens.prescriptions.row_data import elements_from
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUBLISHED_KEY
 
@@ -31,6 +35,7 @@ __all__ = [
     "load_lens",
     "load_prescription",
     "read_lens_file",
+    "read_tolerance_file",
     "read_yaml_file",
     "save_lens",
 ]
@@ -144,6 +149,50 @@ def read_yaml_file(path: str | Path, what: str, option: str = "") -> Any:
         raise InputError(f"{path}: is not valid YAML ({error})") from None
     except InputError as error:
         raise InputError(f"{option}: {error}" if option else error) from None
+
+
+# `drawing` is what a shop is told besides.
+_TOLERANCE_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
+
+
+def read_tolerance_file(
+    lens: Lens, path: str | Path
+) -> tuple[Lens, Mapping[str, Any], Sequence[str]]:
+    """Read a file of tolerances, which is YAML::
+
+        elements:                     # optional, as in a lens file: groups that tilt and move
+          front: {surfaces: [1, 2]}
+        tolerances:                   # as experiment=cooke_sensitivity has them
+          elements.*.tilt_[xy]: 0.05                              # half-ranges: degrees,
+          elements.*.decenter_[xy]: {half_range: 0.02}            # mm,
+          surfaces.*.curvature: {half_range: 0.001, relative: true}    # or shares of the value
+        tolerance_factor: 1           # optional; multiplies all of them
+        drawing: {form: 3/ 2(0.5)}    # optional, for drawings
+
+    An experiment's file does as well: its `lens.elements` and `tolerances` are read.
+
+    Returns:
+        A copy of the lens with the file's elements; what the file says; and keys of an experiment
+        that are not read.
+
+    Raises:
+        InputError: one line that names the file and the key.
+    """
+    content = read_yaml_file(path, "file of tolerances", "--tolerances")
+    require_mapping(content, str(path))
+    elements, unread = content.get("elements"), []
+    if "defaults" in content:
+        own = content.get("lens") or {}
+        require_mapping(own, f"{path}: lens")
+        elements = own.get("elements")
+        unread = [str(key) for key in content if key not in (*_TOLERANCE_KEYS, "defaults", "lens")]
+    else:
+        check_keys(content, _TOLERANCE_KEYS, str(path))
+    lens = copy.deepcopy(lens).requires_grad_(True)
+    for name, element in elements_from(elements, lens.dtype, str(path)).items():
+        lens.elements[name] = element
+    check_elements(dict(lens.elements.items()), len(lens.surfaces))
+    return lens, content, unread
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:

@@ -25,7 +25,6 @@ from dolens.tolerancing.sensitivity import (
 from dolens.tolerancing.tolerances import (
     Tolerances,
     fields_all_around,
-    read_tolerance_file,
     scaled_tolerances,
     tolerances_from,
     usual_tolerances,
@@ -53,7 +52,6 @@ __all__ = [
     "linear_spots",
     "linear_spots_over_field",
     "quantiles",
-    "read_tolerance_file",
     "scaled_tolerances",
     "sensitivities",
     "share_within",

@@ -12,21 +12,17 @@ import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.optics.elements import Element, check_elements
+from dolens.optics.elements import Element
 from dolens.optics.fabrication_errors import fabrication_errors, names_fabrication_errors
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.parameter_names import unit_of
-from dolens.prescriptions.files import read_yaml_file
-from dolens.prescriptions.numbers import require_mapping
-from dolens.prescriptions.row_data import elements_from
 
 DISTRIBUTIONS = ("uniform", "normal")
 _KEYS = ("half_range", "distribution", "relative")
@@ -162,50 +158,6 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         tuple("%" if rows[n][2] else unit_of(n).name for n in names),
         torch.tensor([rows[n][1] for n in names]),
     )
-
-
-# `drawing` is what a shop is told besides.
-_FILE_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
-
-
-def read_tolerance_file(
-    lens: Lens, path: str | Path
-) -> tuple[Lens, Mapping[str, Any], Sequence[str]]:
-    """Read a file of tolerances, which is YAML::
-
-        elements:                     # optional, as in a lens file: groups that tilt and move
-          front: {surfaces: [1, 2]}
-        tolerances:                   # as experiment=cooke_sensitivity has them
-          elements.*.tilt_[xy]: 0.05                              # half-ranges: degrees,
-          elements.*.decenter_[xy]: {half_range: 0.02}            # mm,
-          surfaces.*.curvature: {half_range: 0.001, relative: true}    # or shares of the value
-        tolerance_factor: 1           # optional; multiplies all of them
-        drawing: {form: 3/ 2(0.5)}    # optional, for drawings
-
-    An experiment's file does as well: its `lens.elements` and `tolerances` are read.
-
-    Returns:
-        A copy of the lens with the file's elements; what the file says; and keys of an experiment
-        that are not read.
-
-    Raises:
-        InputError: one line that names the file and the key.
-    """
-    content = read_yaml_file(path, "file of tolerances", "--tolerances")
-    require_mapping(content, str(path))
-    elements, unread = content.get("elements"), []
-    if "defaults" in content:
-        own = content.get("lens") or {}
-        require_mapping(own, f"{path}: lens")
-        elements = own.get("elements")
-        unread = [str(key) for key in content if key not in (*_FILE_KEYS, "defaults", "lens")]
-    else:
-        check_keys(content, _FILE_KEYS, str(path))
-    lens = copy.deepcopy(lens).requires_grad_(True)
-    for name, element in elements_from(elements, lens.dtype, str(path)).items():
-        lens.elements[name] = element
-    check_elements(dict(lens.elements.items()), len(lens.surfaces))
-    return lens, content, unread
 
 
 def scaled_tolerances(tolerances: Tolerances, factor: float) -> Tolerances:
