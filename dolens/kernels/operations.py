@@ -5,6 +5,7 @@ have their counterparts for one ray and for a block of rays; `horner` and `put_p
 in the others, and translated as a shape's functions are.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -35,7 +36,7 @@ def divide(a: Number, b: Number) -> Number:
 
 def sqrt(a: Number) -> Number:
     """Return the square root, rounded to nearest on GPUs too."""
-    return torch.sqrt(a)
+    return torch.sqrt(a) if isinstance(a, torch.Tensor) else math.sqrt(a)
 
 
 def safe_sqrt(squared: Number) -> Number:
@@ -70,6 +71,11 @@ def length(series: Series) -> int:
 def term(series: Series, i: int) -> Number:
     """Return a number of a series."""
     return series[i]
+
+
+def entry(table: Any, i: int) -> int:
+    """Return an integer of a table, which kernels on the CPU are compiled for."""
+    return table[i]
 
 
 def put(cotangents: Any, place: int, value: Number) -> None:

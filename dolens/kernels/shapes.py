@@ -5,10 +5,11 @@ it as it stands.  A backend of kernels compiles copies of it, which `translated`
 code, of the same lines of the same file, with that backend's operations in the place of those of
 tensors, and literals of the rays' precision.  No text is made or executed.
 
-- `p` has the surface's numbers in the order of its `packed`: single ones, and series.
+- `p` has the surface's numbers in the order of its `packed`: single ones, and series; and a table
+  of integers where the structure of the terms differs from surface to surface.
 - Numbers are combined by + - * and comparisons, chosen by `where`, and divided by `divide`; `/`
   is less exact on GPUs in single precision.  Loops run over `range`, and a sum begins with `zero`.
-- There is no `if`: all rays of a block take the same way.
+- There is no `if` but by an `entry` of a table: all rays of a block take the same way.
 - A literal is 2.0, never 2, unless it is an index; an index becomes a number by `number`.
 """
 
@@ -18,6 +19,9 @@ from types import CodeType, FunctionType
 from typing import Any
 
 _named: dict[str, "Shape"] = {}
+
+# Stands in a layout for a table of integers, the surface's `extras`: their number, and they.
+TABLE = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +36,7 @@ class Shape:
         parameters: `(cotangents, p, x, y, of_sag, of_x, of_y)` gives, by `put`, the cotangent of
             each number: of_sag·∂s/∂p + of_x·∂²s/∂x∂p + of_y·∂²s/∂y∂p.
         layout: of p, part by part: None is one number, and an integer a series, whose length
-            stands at this place of the step's row of codes (`table.Code`).
+            stands at this place of the step's row of codes (`table.Code`), or `TABLE`.
         starts_on_conic: the first two numbers are a conic's, from which Newton's iteration starts;
             else it starts on the vertex plane.
     """

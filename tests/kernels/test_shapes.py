@@ -16,9 +16,12 @@ from dolens.optics.surfaces.even_asphere import EVEN_ASPHERE
 from dolens.optics.surfaces.forbes import Q_BFS, Q_CON
 from dolens.optics.surfaces.odd_asphere import ODD_ASPHERE
 from dolens.optics.surfaces.toroid import TOROID
+from dolens.optics.surfaces.xy_polynomial import XY_POLYNOMIAL
+from dolens.optics.surfaces.zernike import ZERNIKE
 
 F64 = torch.float64
-# Numbers of each shape, part by part.
+# Numbers of each shape, part by part; and its table, where the numbers stand for other terms in
+# other surfaces.
 SHAPES = {
     EVEN_ASPHERE: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11)),
     ODD_ASPHERE: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11), 2e-3, (1e-5, 2e-6, -1e-8, 1e-10)),
@@ -26,7 +29,15 @@ SHAPES = {
     Q_BFS: (0.04, -0.6, 7.0, (1e-3, -2e-3, 5e-4, 1e-4)),
     BICONIC: (0.04, -0.03, -0.6, 0.8),
     TOROID: (0.04, -0.6, 1e-3, (2e-5, -1e-7, 3e-9, 1e-11), -0.05),
+    XY_POLYNOMIAL: (0.03, (1e-4, 2e-3, 1e-3, -2e-3)),
+    ZERNIKE: (0.04, -0.6, 1e-3, (2e-5,), 7.0, 0.3, -0.2, (0.0, 1e-2, 2e-3, 3e-3, 5e-3, -4e-3)),
 }
+# There is a b; y²·(x and 1), y, 1.  Terms of (k, m) = (0, 0), (0, 1) and (1, 1).
+TABLES = {
+    XY_POLYNOMIAL: (1, 1, 2, 0, 2, 0, 1, 0, 0),
+    ZERNIKE: (0, 0, 1, 0, 1, 4, 1, 1, 8),
+}
+DATA = {Q_CON: [2], Q_BFS: [2], ZERNIKE: [4, 5, 6]}
 CASES = pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
 
 
@@ -36,7 +47,7 @@ def built(shape, flat):
     for part in SHAPES[shape]:
         series = isinstance(part, tuple)
         parts.append(tuple(next(numbers) for _ in part) if series else next(numbers))
-    return tuple(parts)
+    return (*parts, TABLES[shape]) if shape in TABLES else tuple(parts)
 
 
 def numbers_of(shape):
@@ -79,15 +90,19 @@ def test_cotangents_of_its_numbers_are_those_of_autograd(shape, points):
     shape.parameters(found, built(shape, flat.detach()), *points, *of)
     assert sorted(found) == list(range(len(flat)))
     total = torch.stack([torch.as_tensor(found[i], dtype=F64).sum() for i in range(len(flat))])
-    # A normalisation radius is data.
-    expected[[2] if shape in (Q_CON, Q_BFS) else []] = 0.0
+    # A normalisation radius is data, and a decentre.
+    expected[DATA.get(shape, [])] = 0.0
     torch.testing.assert_close(total, expected, rtol=1e-11, atol=1e-12)
 
 
 def kernels_of(shape, count=4):
     row = np.zeros(64, dtype=np.int64)
     row[COUNT] = row[COLUMNS] = count
-    functions = shapes.kernels(shape).of(row)
+    table = TABLES.get(shape, ())
+    if table:
+        series = [len(part) for part in SHAPES[shape] if isinstance(part, tuple)]
+        row[COUNT], row[COLUMNS] = series[0], series[-1]
+    functions = shapes.kernels(shape).of(row, [len(table), *table])
     return functions.sag, functions.sag_hessian, functions.parameters
 
 
@@ -126,7 +141,7 @@ fma = operations.fma
 
 def test_a_mistake_is_told_by_its_line_in_the_shape_s_own_file():
     shape = Shape("wrong", wrong_literal, wrong_literal, wrong_literal, layout=(None,))
-    factory = shapes.kernels(shape).of(np.zeros(64, dtype=np.int64)).sag
+    factory = shapes.kernels(shape).of(np.zeros(64, dtype=np.int64), []).sag
     line = inspect.getsourcelines(wrong_literal)[1] + 2
     with pytest.raises(NumbaError) as raised:
         compiler._made(factory, "float32", compiler.block_signature(shapes.types.float32))

@@ -27,6 +27,7 @@ from numba.extending import intrinsic
 
 from dolens.kernels.cpu import kernel_files
 from dolens.kernels.cpu.kernel_files import KernelFiles
+from dolens.kernels.cpu.layout import BLOCK
 from dolens.tasks import stage
 
 logger = logging.getLogger("dolens.kernels")
@@ -214,7 +215,7 @@ def _read(files: KernelFiles) -> int | None:
 def _made(factory: Factory, real: str, signature: Any) -> CFunc:
     form = normalize_signature(signature)
     kernel = CFunc(factory(REALS[real]), form, locals={}, options=dict(OPTIONS))
-    with _unrolled() if hasattr(factory, "within") else nullcontext():
+    with _unrolled(factory.longest) if hasattr(factory, "longest") else nullcontext():
         kernel.compile()
     # The function itself belongs to the engine of Numba, which is there for good.
     return kernel
@@ -275,17 +276,27 @@ def _wide_vectors() -> Iterator[None]:
 
 
 @contextmanager
-def _unrolled() -> Iterator[None]:
+def _unrolled(longest: int) -> Iterator[None]:
     """Let LLVM unroll the loops over a shape's series, and not that over a block's 128 rays.
 
     By itself it leaves those of more than some ten steps, and then takes rays one by one: ten times
-    as long.  Afterwards its own limits hold again.
+    as long.  Afterwards its own limits hold again.  Of a series longer than the block, which is
+    three instructions a number at least, the loop over rays is told by its size.
+
+    Args:
+        longest: numbers of the longest series.
     """
-    _set_limits(100_000, 127)
+    if longest < BLOCK:
+        _set_limits(100_000, BLOCK - 1)
+    else:
+        _set_limits(40_000, _ANY)
     try:
         yield
     finally:
-        _set_limits(300, 2**32 - 1)
+        _set_limits(300, _ANY)
+
+
+_ANY = 2**32 - 1
 
 
 def _set_limits(threshold: int, steps: int) -> None:
@@ -347,6 +358,6 @@ class StepFunctions:
     scratch: Callable[[Sequence[int]], int] = _none
     numbers: int | None = None
 
-    def of(self, row: Row) -> "StepFunctions":
+    def of(self, row: Row, extras: Row) -> "StepFunctions":
         """Return the functions of a step with this row of codes: these, whatever it says."""
         return self

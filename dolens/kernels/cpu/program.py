@@ -62,15 +62,15 @@ _STEPS = {
 }
 
 
-def functions_of(row: Row, place: int = Code.KIND) -> StepFunctions:
-    """Return the functions of a step by its row of codes; a surface's module is imported for them.
+def kernels_at(row: Row, place: int = Code.KIND) -> Any:
+    """Return the kernels of a step by its row of codes; a surface's module is imported for them.
 
     Args:
         row: of the step.
         place: `Code.BASE` for the surface that a deflection stands on.
     """
     code = int(row[place])
-    return _STEPS[Kind(code)] if code in _STEPS else kernels_of(code, "cpu").of(row)
+    return _STEPS[Kind(code)] if code in _STEPS else kernels_of(code, "cpu")
 
 
 class Steps(NamedTuple):
@@ -90,18 +90,19 @@ class Steps(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
-    """Compile what the steps of a table need: a pure function of its codes."""
+def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool) -> Steps:
+    """Compile what the steps of a table need: a pure function of its codes and its extras."""
+    extras = np.frombuffer(integers, dtype=np.int64)
     table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
     rows = np.zeros((max(len(table), 1), CODE_ROW), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
         if row[Code.KIND] == Kind.DEFLECT:
-            _compile_law(row, real, derivatives)
+            _compile_law(row, extras, real, derivatives)
             longest = max(longest, int(row[Code.LENGTH]))
             continue
-        functions = functions_of(row)
+        functions = kernels_at(row).of(row, extras)
         numbers = int(row[Code.LENGTH]) - Slot.HEADER
         if functions.numbers not in (None, numbers):
             kernel = functions.sag or functions.forward
@@ -111,7 +112,7 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
             )
         row[FORWARD] = compiler.compile_block(functions.forward, real)
         if functions.sag is not None:
-            _compile_sag(row, functions, real, derivatives)
+            _compile_sag(row, extras, functions, real, derivatives)
             row[STARTS_ON_CONIC], row[STENCIL] = functions.starts_on_conic, functions.stencil
         if derivatives:
             row[ADJOINT] = compiler.compile_block(functions.adjoint, real)
@@ -141,7 +142,7 @@ class Frame(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _frame(
-    key: tuple[bytes, str, bool], extras: int, outputs: int, columns: int, size: int
+    key: tuple[bytes, bytes, str, bool], extras: int, outputs: int, columns: int, size: int
 ) -> Frame:
     """Return the frame of programs.
 
@@ -152,7 +153,7 @@ def _frame(
         columns: further rows of a block that a driver asks for.
         size: bytes of a number.
     """
-    steps, derivatives = _steps(*key), key[2]
+    steps, derivatives = _steps(*key), key[-1]
     codes = steps.codes.copy()
     codes[:, EXTRAS_ADDRESS] = extras + 8 * codes[:, Code.EXTRAS]
     job = np.zeros(jobs.LENGTH, dtype=np.int64)
@@ -179,15 +180,18 @@ def _frame(
 def frame_of(table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0) -> Frame:
     """Return the frame of a table's programs; the arguments are `Program`'s."""
     values, extras = table.values, table.extras
-    key = (table.codes.numpy().tobytes(), REAL[values.dtype], derivatives)
+    integers = (table.codes.numpy().tobytes(), extras.numpy().tobytes())
+    key = (*integers, REAL[values.dtype], derivatives)
     return _frame(key, extras.data_ptr(), outputs, columns, values.itemsize)
 
 
-def _compile_sag(row: np.ndarray, functions: StepFunctions, real: str, derivatives: bool) -> None:
+def _compile_sag(
+    row: np.ndarray, extras: np.ndarray, functions: StepFunctions, real: str, derivatives: bool
+) -> None:
     """Compile what a surface that is given by its sag needs."""
     parts = [(functions, (SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS))]
     if functions.on_asphere:
-        asphere = shapes.kernels(shape_named("even_asphere")).of(row)
+        asphere = shapes.kernels(shape_named("even_asphere")).of(row, extras)
         parts.append((asphere, (ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS)))
     for own, places in parts:
         three = (own.sag, own.sag_hessian, own.parameters)
@@ -196,13 +200,13 @@ def _compile_sag(row: np.ndarray, functions: StepFunctions, real: str, derivativ
                 row[place] = compiler.compile_block(function, real)
 
 
-def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
+def _compile_law(row: np.ndarray, extras: np.ndarray, real: str, derivatives: bool) -> None:
     """Compile a deflection's law, and for a phase the sag of the surface that it stands on."""
     law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
-    base = functions_of(row, Code.BASE)
+    base = kernels_at(row, Code.BASE).of(row, extras)
     if base.sag is None:
         # Planes, spheres and conics are aspheres without coefficients: c, k and a2 = 0.
-        base = shapes.kernels(shape_named("even_asphere")).of(row)
+        base = shapes.kernels(shape_named("even_asphere")).of(row, extras)
     always = [(FORWARD, law.forward), (PHASE_AND_SLOPES, law.phase)]
     for_adjoint = [
         (ADJOINT, law.adjoint),
@@ -210,7 +214,7 @@ def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
         (PHASE_PARAMETERS, law.phase_parameters),
     ]
     if law.phase is not None:
-        _compile_sag(row, base, real, derivatives)
+        _compile_sag(row, extras, base, real, derivatives)
     for place, function in always + (for_adjoint if derivatives else []):
         if function is not None:
             row[place] = compiler.compile_block(function, real)
@@ -399,7 +403,7 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
     steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
     rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
     first_step = int(steps.min(initial=codes.shape[0]))
-    stencils = np.array([functions_of(row).stencil for row in codes], dtype=bool)
+    stencils = np.array([kernels_at(row).stencil for row in codes], dtype=bool)
     local = stencils[steps] & (rows >= COTANGENT_HEADER + Slot.HEADER)
     spline = None
     if local.any():

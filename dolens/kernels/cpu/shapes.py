@@ -17,7 +17,15 @@ from numba.extending import intrinsic
 
 from dolens.kernels import operations
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import OPTIONS, Factory, Row, StepFunctions, pointer, shifted
+from dolens.kernels.cpu.compiler import (
+    INTEGERS,
+    OPTIONS,
+    Factory,
+    Row,
+    StepFunctions,
+    pointer,
+    shifted,
+)
 from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
@@ -37,7 +45,8 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     WORK_SIZE,
 )
-from dolens.kernels.shapes import Shape, functions_within, translated
+from dolens.kernels.shapes import TABLE, Shape, functions_within, translated
+from dolens.kernels.table import Code
 
 _INTEGER = ir.IntType(64)
 _AS_REAL = {types.float32: np.float32, types.float64: np.float64}
@@ -100,6 +109,12 @@ def _operations(real: types.Type) -> dict[Any, Any]:
         )
 
     @intrinsic
+    def entry(context, table, i):  # noqa: ANN001, ANN202
+        return types.int64(table, types.int64), lambda _, builder, __, given: builder.load(
+            builder.gep(builder.extract_value(given[0], 0), [given[1]])
+        )
+
+    @intrinsic
     def put(context, cotangents, place, value):  # noqa: ANN001, ANN202
         require("put", value)
 
@@ -110,7 +125,7 @@ def _operations(real: types.Type) -> dict[Any, Any]:
 
         return types.void(cotangents, types.int64, value), generate
 
-    own = (fma, divide, sqrt, where, zero, number, length, term, put)
+    own = (fma, divide, sqrt, where, zero, number, length, term, entry, put)
     known = {getattr(operations, one.__name__): one for one in own}
     return known | {operations.safe_sqrt: arithmetic(real).safe_sqrt}
 
@@ -132,17 +147,23 @@ def _compiled(function: Callable[..., Any], real: types.Type) -> Any:
     )
 
 
-def _unpacked(real: types.Type, sizes: Sequence[int | None]) -> Any:
+Size = int | tuple[int, ...] | None
+
+
+def _unpacked(real: types.Type, sizes: Sequence[Size]) -> Any:
     """Return the function of a pointer that reads a shape's numbers: p of `Shape`.
 
-    A series is a place on the stack and its length: LLVM keeps it in registers.
+    A series is a place on the stack and its length: LLVM keeps it in registers.  A table is a
+    constant.
 
     Args:
         real: the precision.
-        sizes: of each part: None of a single number, else the length of a series.
+        sizes: of each part: None of a single number, the length of a series, or a table.
     """
     series = types.Tuple((pointer(real), types.int64))
-    parts = types.Tuple([real if size is None else series for size in sizes])
+    table = types.Tuple((INTEGERS, types.int64))
+    kinds = {type(None): real, int: series, tuple: table}
+    parts = types.Tuple([kinds[type(size)] for size in sizes])
 
     def generate(context, builder, signature, given):  # noqa: ANN001, ANN202
         place, values = 0, []
@@ -155,6 +176,12 @@ def _unpacked(real: types.Type, sizes: Sequence[int | None]) -> Any:
         for size in sizes:
             if size is None:
                 values.append(following())
+                continue
+            if isinstance(size, tuple):
+                held = ir.Constant(ir.ArrayType(_INTEGER, len(size)), size)
+                slot = cgutils.global_constant(builder, "table", held)
+                first = builder.gep(slot, [_INTEGER(0), _INTEGER(0)])
+                values.append(context.make_tuple(builder, table, [first, _INTEGER(len(size))]))
                 continue
             kind = ir.ArrayType(context.get_value_type(real), max(size, 1))
             slot = builder.gep(cgutils.alloca_once(builder, kind), [_INTEGER(0), _INTEGER(0)])
@@ -174,7 +201,7 @@ def _factory(
     function: Callable[..., Any],
     block: Callable[[Any, Any], Callable[..., None]],
     name: str,
-    sizes: tuple[int | None, ...],
+    sizes: tuple[Size, ...],
 ) -> Factory:
     """Return the factory of a block function that inlines a shape's function.
 
@@ -190,6 +217,7 @@ def _factory(
 
     factory.__name__, factory.__qualname__ = name, f"{name}{sizes}"
     factory.within = functions_within(function)  # type: ignore[attr-defined]
+    factory.longest = max((n for n in sizes if isinstance(n, int)), default=0)  # type: ignore[attr-defined]
     return factory
 
 
@@ -227,28 +255,33 @@ def _parameters_block(parameters: Any, unpacked: Any) -> Callable[..., None]:
 
 
 @cache
-def _step_functions(shape: Shape, sizes: tuple[int | None, ...]) -> StepFunctions:
+def _step_functions(shape: Shape, sizes: tuple[Size, ...]) -> StepFunctions:
     parts = (
         (shape.sag, _sag_block, "sag"),
         (shape.sag_hessian, _hessian_block, "hessian"),
         (shape.parameters, _parameters_block, "parameters"),
     )
     made = (_factory(f, block, f"{shape.name}_{part}", sizes) for f, block, part in parts)
-    numbers = sum(1 if size is None else size for size in sizes)
+    numbers = sum(1 if size is None else size for size in sizes if not isinstance(size, tuple))
     return given_by_sag(*made, starts_on_conic=shape.starts_on_conic, numbers=numbers)
 
 
 class ShapeKernels(NamedTuple):
-    """The kernels of a shape differ with the lengths of its series."""
+    """The kernels of a shape differ with the lengths of its series, and with its table."""
 
     shape: Shape
+    stencil: bool = False
 
-    def of(self, row: Row) -> StepFunctions:
-        """Return the functions of a step with this row of codes."""
-        layout = self.shape.layout
-        return _step_functions(
-            self.shape, tuple(None if place is None else int(row[place]) for place in layout)
-        )
+    def of(self, row: Row, extras: Row) -> StepFunctions:
+        """Return the functions of a step with this row of codes, and the lens's extras."""
+
+        def size(place: int | None) -> Size:
+            if place != TABLE:
+                return None if place is None else int(row[place])
+            first = int(row[Code.EXTRAS])
+            return tuple(map(int, extras[first + 1 : first + 1 + int(extras[first])]))
+
+        return _step_functions(self.shape, tuple(map(size, self.shape.layout)))
 
 
 kernels = ShapeKernels

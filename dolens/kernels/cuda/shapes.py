@@ -9,11 +9,14 @@ import triton
 import triton.language as tl
 from triton.runtime.interpreter import InterpretedFunction
 
-from dolens.kernels import operations
+from dolens.kernels import operations, shapes
 from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.layout import SHAPE
+from dolens.kernels.cuda.layout import EXTRAS, SHAPE
 from dolens.kernels.shapes import Shape, shape_named, translated
+
+# In the place of a layout's None, which Triton does not compare; and a table.
+SINGLE, TABLE = tl.constexpr(-2), tl.constexpr(shapes.TABLE)
 
 
 @triton.jit
@@ -62,6 +65,12 @@ def term(series, i):
 
 
 @triton.jit
+def entry(table, i):
+    """Return an integer of a table."""
+    return tl.load(table[0] + i)
+
+
+@triton.jit
 def put(cotangents, place, value):
     """Add a number's cotangents to its sum; see `add_sum`."""
     add_sum(cotangents[0] + place, value, cotangents[1])
@@ -71,7 +80,7 @@ _OPERATIONS = {
     getattr(operations, name): made
     for name, made in {
         "fma": fma, "divide": divide, "sqrt": sqrt, "safe_sqrt": safe_sqrt, "where": where,
-        "zero": zero, "number": number, "length": length, "term": term, "put": put,
+        "zero": zero, "number": number, "length": length, "term": term, "entry": entry, "put": put,
     }.items()
 }  # fmt: skip
 
@@ -87,11 +96,14 @@ def _compiled(function: Callable[..., Any]) -> Any:
 
 
 @triton.jit
-def _unpacked(place, codes, LAYOUT: tl.constexpr):
+def _unpacked(place, codes, extras, LAYOUT: tl.constexpr):
     """Return p of a `Shape` from the place of its numbers."""
     p = ()
     for k in tl.static_range(len(LAYOUT)):
-        if LAYOUT[k] < 0:
+        if LAYOUT[k] == TABLE:
+            table = extras + tl.load(codes + EXTRAS)
+            p = p + ((table + 1, tl.load(table)),)  # type: ignore[assignment]  # noqa: RUF005
+        elif LAYOUT[k] == SINGLE:
             p = p + (tl.load(place),)  # type: ignore[assignment]  # noqa: RUF005
             place += 1
         else:
@@ -103,11 +115,12 @@ def _unpacked(place, codes, LAYOUT: tl.constexpr):
 
 # The names in capitals are bound for each shape.
 def _sag(record, codes, extras, x, y):
-    return FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
+    return FUNCTION(_unpacked(record + SHAPE, codes, extras, LAYOUT), x, y)  # noqa: F821
 
 
 def _hessian(record, codes, extras, x, y):
-    sx, sy, sxx, sxy, syy = FUNCTION(_unpacked(record + SHAPE, codes, LAYOUT), x, y)  # noqa: F821
+    p = _unpacked(record + SHAPE, codes, extras, LAYOUT)  # noqa: F821
+    sx, sy, sxx, sxy, syy = FUNCTION(p, x, y)  # noqa: F821
     # A derivative may be one for all rays.
     return (
         tl.broadcast_to(sx, x.shape),
@@ -119,14 +132,14 @@ def _hessian(record, codes, extras, x, y):
 
 
 def _add_sums(record, codes, extras, sums, x, y, of_sag, of_x, of_y, alive):
-    p = _unpacked(record + SHAPE, codes, LAYOUT)  # noqa: F821
+    p = _unpacked(record + SHAPE, codes, extras, LAYOUT)  # noqa: F821
     FUNCTION((sums + SHAPE, alive), p, x, y, of_sag, of_x, of_y)  # noqa: F821
 
 
 @cache
 def kernels(shape: Shape) -> SagFunctions:
     """Return the three functions of a shape."""
-    layout: Any = tuple(-1 if place is None else int(place) for place in shape.layout)
+    layout: Any = tuple(SINGLE.value if place is None else int(place) for place in shape.layout)
     if not isinstance(_unpacked, InterpretedFunction):
         layout = tl.constexpr(layout)
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
-from dolens.kernels.shapes import Shape
+from dolens.kernels.shapes import TABLE, Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Code
 from dolens.optics.rays import Components
@@ -80,7 +80,8 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
         parts: what its functions take; a number that is no tensor is zero.
         more: further fields of `PackedShape`.
 
-    A series is filled up to a multiple of four, and its length stands where the layout says.
+    A series is filled up to a multiple of four, and its length stands where the layout says.  A
+    table makes the extras; beside it, nothing is filled up.
 
     Raises:
         InputError: more or fewer parts than the layout has.
@@ -89,12 +90,15 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
         raise InputError(f"a layout of {len(layout)} parts, where `numbers` gives {len(parts)}")
     fields = {Code.COUNT: "count", Code.COLUMNS: "columns", Code.DEGREE: "degree"}
     numbers: list[Any] = []
+    group = 1 if TABLE in layout else 4
     for place, part in zip(layout, parts, strict=True):
         if place is None:
             numbers.append(part)
+        elif place == TABLE:
+            more["extras"] = (len(part), *part)
         else:
-            numbers += (*part, *(-len(part) % 4) * (0.0,))
-            more[fields[place]] = len(part) + -len(part) % 4
+            numbers += (*part, *(-len(part) % group) * (0.0,))
+            more[fields[place]] = len(part) + -len(part) % group
     tensors = (number if isinstance(number, Tensor) else None for number in numbers)
     return PackedShape(tuple(tensors), **more)
 
@@ -227,7 +231,12 @@ class Surface(nn.Module):
         """
         if cls.shape is None:
             raise NotImplementedError
-        sag, sx, sy, exists = cls.shape.sag(cls.numbers(p), x, y)
+        *found, exists = cls.shape.sag(cls.numbers(p), x, y)
+        # A number may be the same everywhere, and no tensor.
+        zero = torch.zeros_like(x + y)
+        sag, sx, sy = (
+            n if isinstance(n, Tensor) and n.dim() >= zero.dim() else zero + n for n in found
+        )
         return sag, sx, sy, exists.detach() if isinstance(exists, Tensor) else None
 
     @classmethod

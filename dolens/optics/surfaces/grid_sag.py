@@ -14,7 +14,7 @@ from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.surfaces.even_asphere import AsphereWithTerms
+from dolens.optics.surfaces.even_asphere import AsphereWithTerms, EvenAsphere, even_asphere
 from dolens.optics.surfaces.registry import register_surface
 
 _ARRAYS = ("sag", "slope_x", "slope_y", "twist")
@@ -72,31 +72,32 @@ class GridSag(AsphereWithTerms):
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Return sag and slopes, and a margin that is positive on the conic and on the grid."""
-        sag, sx, sy, exists = super().sag_and_gradient(p, x, y)
+        sag, sx, sy, exists = EvenAsphere.sag_and_gradient(even_asphere(p), x, y)
+        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
+        spacing = (p["spacing_x"], p["spacing_y"])
+        added, ax, ay = bicubic(nodes, spacing, x - p["decenter_x"], y - p["decenter_y"])
         half_x, half_y = half_sizes(p)
         inside = torch.minimum(
             half_x - (x - p["decenter_x"]).detach().abs(),
             half_y - (y - p["decenter_y"]).detach().abs(),
         )
-        return sag, sx, sy, inside if exists is None else torch.minimum(exists, inside)
+        inside = inside if exists is None else torch.minimum(exists, inside)
+        return sag + added, sx + ax, sy + ay, inside
 
     @classmethod
-    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the grid's sag and slopes."""
-        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
-        spacing = (p["spacing_x"], p["spacing_y"])
-        return bicubic(nodes, spacing, x - p["decenter_x"], y - p["decenter_y"])
-
-    @classmethod
-    def added_numbers(cls, p: Parameters) -> PackedShape:
-        """Return spacings, decentre, and the nodes' four numbers each, by rows: all are data.
+    def packed(cls, p: Parameters) -> PackedShape:
+        """Return the even asphere's numbers, and spacings, decentre, and the nodes' four numbers
+        each, by rows, which are data.
 
         Columns and degree: how many columns and rows.
         """
         nodes = torch.stack([p[name] for name in _ARRAYS], -1)
         rows, columns = p["sag"].shape
-        numbers = (*(p[name] for name in _LENGTHS), nodes)
-        return PackedShape(numbers, columns=columns, degree=rows, data=4 + nodes.numel())
+        own = (*(p[name] for name in _LENGTHS), nodes)
+        even = EvenAsphere.packed(even_asphere(p))
+        return even._replace(
+            numbers=(*even.numbers, *own), columns=columns, degree=rows, data=4 + nodes.numel()
+        )
 
 
 def half_sizes(p: Parameters) -> tuple[Tensor, Tensor]:

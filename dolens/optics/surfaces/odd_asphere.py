@@ -21,7 +21,7 @@ from dolens.kernels.operations import (
 )
 from dolens.kernels.shapes import Shape
 from dolens.kernels.table import Code
-from dolens.optics.surfaces.base import PackedShape, Parameters, by_names, packed_as
+from dolens.optics.surfaces.base import Parameters
 from dolens.optics.surfaces.even_asphere import (
     EVEN_ASPHERE,
     AsphereWithTerms,
@@ -137,20 +137,6 @@ class OddAsphere(AsphereWithTerms):
         highest = max((power for name in p if (power := power_of(name)) and power % 2), default=1)
         odd = tuple(p.get(f"a{power}", 0.0) for power in range(3, highest + 1, 2))
         return *EvenAsphere.numbers(p), p.get("a1", 0.0), odd
-
-    @classmethod
-    def sag_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return sag and slopes, and the margin of the conic's branch."""
-        sag, sx, sy, exists = odd_asphere_sag(cls.numbers(p), x, y)
-        return sag, sx, sy, exists.detach()
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters) -> PackedShape:
-        """Return the even asphere's numbers, a1, and a3, a5, ..., in groups of four."""
-        return packed_as(ODD_ASPHERE.layout, cls.numbers(p))
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

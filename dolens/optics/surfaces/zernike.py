@@ -16,10 +16,33 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.operations import (
+    Number,
+    divide,
+    entry,
+    fma,
+    length,
+    number,
+    put,
+    sqrt,
+    term,
+    where,
+    zero,
+)
+from dolens.kernels.shapes import TABLE, Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters
+from dolens.kernels.table import Code
+from dolens.optics.surfaces.base import Parameters
 from dolens.optics.surfaces.clear_aperture import ClearAperture
-from dolens.optics.surfaces.even_asphere import AsphereWithTerms
+from dolens.optics.surfaces.even_asphere import (
+    EVEN_ASPHERE,
+    AsphereWithTerms,
+    EvenAsphere,
+    even_asphere,
+    even_asphere_hessian,
+    even_asphere_parameters,
+    even_asphere_sag,
+)
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
 
 FRINGE_TERMS = 37
@@ -73,7 +96,224 @@ def fringe(number: int) -> ZernikeTerm:
 
 
 _TERM = order_pattern("z")
-_KERNELS = ("dolens.kernels.cpu.zernike", "dolens.kernels.cuda.zernike")
+
+
+def _step(k: Number, m: Number) -> tuple[Number, Number, Number]:
+    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), for k ≥ 1.
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 22.7.1, at x = 2q - 1.
+    """
+    lower, here, both = 2.0 * k + m - 2.0, 2.0 * k + m - 1.0, 2.0 * k + m
+    scale = 2.0 * k * (k + m)
+    slope = divide(here * both, scale)
+    # Where it is zero, so are the numbers over it.
+    scale = scale * where(lower > 0.0, lower, 1.0)
+    offset = divide(here * m * m, scale)
+    return 2.0 * slope, -offset - slope, divide(2.0 * (k - 1.0) * (k + m - 1.0) * both, scale)
+
+
+def terms_slopes(
+    terms: Any, table: Any, u: Number, v: Number, like: Number
+) -> tuple[Number, Number, Number]:
+    """Return the sum of the terms at u, v, and its derivatives there.
+
+    ρ^m·cos(mφ) and ρ^m·sin(mφ) are C = Re w^m and S = Im w^m with w = u + i·v: polynomials, with no
+    angle and no division at the centre.  The derivatives of C along u and v are m·C' and -m·S' of
+    w^(m-1), and those of S m·S' and m·C'.
+
+    Args:
+        terms: coefficients of cosine and sine, by turns.
+        table: three integers for each term: k, m, and the square of its norm.  From k = 0 on, k
+            grows for each m.
+        u: x over the radius, and v.
+        v: y over it.
+        like: a number of the surface's.
+    """
+    q = fma(u, u, v * v)
+    total, su, sv, radial = zero(u), zero(u), zero(u), zero(u)
+    value, slope, value_below, slope_below = zero(u) + 1.0, zero(u), zero(u), zero(u)
+    c, s, c1, s1 = zero(u) + 1.0, zero(u), zero(u), zero(u)
+    for t in range(length(table) // 3):
+        k, m = entry(table, 3 * t), number(entry(table, 3 * t + 1), like)
+        if k == 0:
+            value, slope, value_below, slope_below = zero(u) + 1.0, zero(u), zero(u), zero(u)
+            if entry(table, 3 * t + 1) > 0:
+                c1, s1 = c, s
+                c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
+        else:
+            alpha, beta, gamma = _step(number(k, like), m)
+            factor = fma(alpha, q, beta)
+            above = fma(factor, value, -gamma * value_below)
+            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
+            value_below, slope_below, value, slope = value, slope, above, slope_above
+        norm = sqrt(number(entry(table, 3 * t + 2), like))
+        a, b = norm * term(terms, 2 * t), norm * term(terms, 2 * t + 1)
+        both = fma(a, c, b * s)
+        total = fma(both, value, total)
+        radial = fma(both, slope, radial)
+        su = fma(m * (a * c1 + b * s1), value, su)
+        sv = fma(m * (b * c1 - a * s1), value, sv)
+    return total, fma(2.0 * u, radial, su), fma(2.0 * v, radial, sv)
+
+
+def terms_second(
+    terms: Any, table: Any, u: Number, v: Number, like: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Return the sum of the terms at u, v, and its first and second derivatives there.
+
+    With E = a·C + b·S of a term, and G1 and G2 the same with w^(m-1) and w^(m-2) and their factors
+    m and m(m-1): s_uu = G2·P + 4u·G1·P' + E·(2P' + 4u²·P'').
+    """
+    q = fma(u, u, v * v)
+    e0, e1, e2, g0, h0, g1, h1, g2, h2 = (
+        zero(u), zero(u), zero(u), zero(u), zero(u), zero(u), zero(u), zero(u), zero(u)
+    )  # fmt: skip
+    value, slope, second = zero(u) + 1.0, zero(u), zero(u)
+    value_below, slope_below, second_below = zero(u), zero(u), zero(u)
+    c, s, c1, s1, c2, s2 = zero(u) + 1.0, zero(u), zero(u), zero(u), zero(u), zero(u)
+    for t in range(length(table) // 3):
+        k, m = entry(table, 3 * t), number(entry(table, 3 * t + 1), like)
+        if k == 0:
+            value, slope, second = zero(u) + 1.0, zero(u), zero(u)
+            value_below, slope_below, second_below = zero(u), zero(u), zero(u)
+            if entry(table, 3 * t + 1) > 0:
+                c2, s2, c1, s1 = c1, s1, c, s
+                c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
+        else:
+            alpha, beta, gamma = _step(number(k, like), m)
+            factor = fma(alpha, q, beta)
+            above = fma(factor, value, -gamma * value_below)
+            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
+            second_above = fma(factor, second, 2.0 * alpha * slope - gamma * second_below)
+            value_below, slope_below, second_below = value, slope, second
+            value, slope, second = above, slope_above, second_above
+        norm = sqrt(number(entry(table, 3 * t + 2), like))
+        a, b = norm * term(terms, 2 * t), norm * term(terms, 2 * t + 1)
+        both, along, across = fma(a, c, b * s), m * (a * c1 + b * s1), m * (b * c1 - a * s1)
+        pairs = m * (m - 1.0)
+        e0, e1, e2 = fma(both, value, e0), fma(both, slope, e1), fma(both, second, e2)
+        g0, h0 = fma(along, value, g0), fma(across, value, h0)
+        g1, h1 = fma(along, slope, g1), fma(across, slope, h1)
+        g2 = fma(pairs * (a * c2 + b * s2), value, g2)
+        h2 = fma(pairs * (b * c2 - a * s2), value, h2)
+    e1, e2, g1, h1 = 2.0 * e1, 4.0 * e2, 2.0 * g1, 2.0 * h1
+    return (
+        e0,
+        g0 + u * e1,
+        h0 + v * e1,
+        g2 + 2.0 * u * g1 + e1 + u * u * e2,
+        h2 + u * h1 + v * g1 + u * v * e2,
+        e1 - g2 + 2.0 * v * h1 + v * v * e2,
+    )
+
+
+def put_terms(
+    cotangents: Any, place: int, table: Any, u: Number, v: Number, like: Number,
+    of_sum: Number, of_u: Number, of_v: Number,
+) -> None:  # fmt: skip
+    """Set the cotangents of the coefficients, from `place` on, from those of the sum and its
+    derivatives along u and v.
+
+    Of a: of_sum·C·P + of_u·(m·C'·P + 2u·C·P') + of_v·(-m·S'·P + 2v·C·P').
+    """
+    q = fma(u, u, v * v)
+    of_slope = 2.0 * (of_u * u + of_v * v)
+    value, slope, value_below, slope_below = zero(u) + 1.0, zero(u), zero(u), zero(u)
+    c, s, c1, s1 = zero(u) + 1.0, zero(u), zero(u), zero(u)
+    for t in range(length(table) // 3):
+        k, m = entry(table, 3 * t), number(entry(table, 3 * t + 1), like)
+        if k == 0:
+            value, slope, value_below, slope_below = zero(u) + 1.0, zero(u), zero(u), zero(u)
+            if entry(table, 3 * t + 1) > 0:
+                c1, s1 = c, s
+                c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
+        else:
+            alpha, beta, gamma = _step(number(k, like), m)
+            factor = fma(alpha, q, beta)
+            above = fma(factor, value, -gamma * value_below)
+            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
+            value_below, slope_below, value, slope = value, slope, above, slope_above
+        norm = sqrt(number(entry(table, 3 * t + 2), like))
+        of_value, of_derivative = norm * value, norm * slope * of_slope
+        of_c = of_sum * c + m * (of_u * c1 - of_v * s1)
+        of_s = of_sum * s + m * (of_u * s1 + of_v * c1)
+        put(cotangents, place + 2 * t, of_c * of_value + c * of_derivative)
+        put(cotangents, place + 1 + 2 * t, of_s * of_value + s * of_derivative)
+
+
+def terms_of(
+    found: Mapping[tuple[int, int, bool], Any], normalised: bool
+) -> tuple[tuple[Any, ...], tuple[int, ...]]:
+    """Return coefficients of cosine and sine term by term, 0.0 between them, and the table of the
+    terms: of each m all k up to the highest.
+
+    Args:
+        found: coefficients by k, m, and whether of the sine.
+        normalised: whether terms have unit variance.
+    """
+    highest = [0] * (1 + max((m for _, m, _ in found), default=0))
+    for k, m, _ in found:
+        highest[m] = max(highest[m], k)
+    terms = [(k, m) for m, most in enumerate(highest) for k in range(most + 1)]
+    coefficients = (found.get((k, m, sine), 0.0) for k, m in terms for sine in (False, True))
+    norms = [(2 * k + m + 1) * (2 if m else 1) if normalised else 1 for k, m in terms]
+    table = ((k, m, norm) for (k, m), norm in zip(terms, norms, strict=True))
+    return tuple(coefficients), tuple(n for row in table for n in row)
+
+
+def zernike_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:
+    """Return sag and slopes, and the margin of the conic's branch."""
+    curvature, conic, a2, even, radius, decenter_x, decenter_y, terms, table = p
+    sag, sx, sy, margin = even_asphere_sag((curvature, conic, a2, even), x, y)
+    scale = divide(1.0, radius)
+    u, v = (x - decenter_x) * scale, (y - decenter_y) * scale
+    added, su, sv = terms_slopes(terms, table, u, v, radius)
+    return sag + added, fma(su, scale, sx), fma(sv, scale, sy), margin
+
+
+def zernike_hessian(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number, Number]:
+    """Return slopes and second derivatives."""
+    curvature, conic, a2, even, radius, decenter_x, decenter_y, terms, table = p
+    sx, sy, sxx, sxy, syy = even_asphere_hessian((curvature, conic, a2, even), x, y)
+    scale = divide(1.0, radius)
+    u, v = (x - decenter_x) * scale, (y - decenter_y) * scale
+    _, su, sv, suu, suv, svv = terms_second(terms, table, u, v, radius)
+    squared = scale * scale
+    return (
+        fma(su, scale, sx),
+        fma(sv, scale, sy),
+        fma(suu, squared, sxx),
+        fma(suv, squared, sxy),
+        fma(svv, squared, syy),
+    )
+
+
+def zernike_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_sag: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of the even asphere's numbers and of the coefficients; the normalisation
+    radius and the decentre are data.
+    """
+    curvature, conic, a2, even, radius, decenter_x, decenter_y, _, table = p
+    even_asphere_parameters(cotangents, (curvature, conic, a2, even), x, y, of_sag, of_x, of_y)
+    place = 3 + length(even)
+    put(cotangents, place, zero(x))
+    put(cotangents, place + 1, zero(x))
+    put(cotangents, place + 2, zero(x))
+    scale = divide(1.0, radius)
+    u, v = (x - decenter_x) * scale, (y - decenter_y) * scale
+    put_terms(cotangents, place + 3, table, u, v, radius, of_sag, of_x * scale, of_y * scale)
+
+
+ZERNIKE = Shape(
+    "zernike",
+    zernike_sag,
+    zernike_hessian,
+    zernike_parameters,
+    layout=(*EVEN_ASPHERE.layout, None, None, None, Code.COLUMNS, TABLE),
+    starts_on_conic=True,
+)
+_KERNEL = SurfaceKernel(shape=ZERNIKE)
 
 
 class ZernikeSag(AsphereWithTerms):
@@ -85,6 +325,7 @@ class ZernikeSag(AsphereWithTerms):
     the clear aperture may exceed it.
     """
 
+    shape = ZERNIKE
     constants = ("normalization_radius", "decenter_x", "decenter_y")
     terms: ClassVar[int]
     term: ClassVar[Callable[[int], ZernikeTerm]]
@@ -108,74 +349,14 @@ class ZernikeSag(AsphereWithTerms):
         return [*(f"z{number}" for number in numbers), *cls.constants]
 
     @classmethod
-    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return Σ z_j·Z_j and its slopes, azimuthal order by order.
-
-        ρ^m·cos(mφ) and ρ^m·sin(mφ) are Re w^m and Im w^m with w = u + i·v: polynomials, with no
-        angle and no division at the centre.
-        """
-        scale = 1.0 / p["normalization_radius"]
-        u, v = (x - p["decenter_x"]) * scale, (y - p["decenter_y"]) * scale
-        q = torch.addcmul(u * u, v, v)
-        zero = torch.zeros_like(q)
-        sag, su, sv = zero, zero, zero
-        cosine, sine, cosine_below, sine_below = torch.ones_like(q), zero, zero, zero
-        groups = cls._groups(p)
-        for m in range(max(groups, default=-1) + 1):
-            group = groups.get(m, {})
-            # Cosines times a, sines times b, and their derivatives in q.
-            a, da, b, db = zero, zero, zero, zero
-            for k, (value, slope) in enumerate(jacobi(q, m, max(group, default=-1) + 1)):
-                for name, is_sine, norm in group.get(k, ()):
-                    coefficient = norm * p[name]
-                    if is_sine:
-                        b, db = b + coefficient * value, db + coefficient * slope
-                    else:
-                        a, da = a + coefficient * value, da + coefficient * slope
-            if group:
-                sag = sag + cosine * a + sine * b
-                radial = 2.0 * (cosine * da + sine * db)
-                su = su + m * (cosine_below * a + sine_below * b) + u * radial
-                sv = sv + m * (cosine_below * b - sine_below * a) + v * radial
-            cosine, sine, cosine_below, sine_below = (
-                cosine * u - sine * v,
-                sine * u + cosine * v,
-                cosine,
-                sine,
-            )
-        return sag, su * scale, sv * scale
-
-    @classmethod
-    def added_numbers(cls, p: Parameters) -> PackedShape:
-        """Return the constants and then the coefficients; columns: how many; degree: highest m.
-
-        Extras: whether terms are normalised; then for each m from 0 the number of radial orders,
-        and for each of these the place of the cosine's and of the sine's coefficient, or -1.
-        """
-        groups = cls._groups(p)
-        names = [name for name in p if _TERM.fullmatch(name)]
-        extras = [int(cls.term is noll)]
-        highest = max(groups, default=0)
-        for m in range(highest + 1):
-            group = groups.get(m, {})
-            extras.append(max(group, default=-1) + 1)
-            for k in range(extras[-1]):
-                places = [-1, -1]
-                for name, is_sine, _ in group.get(k, ()):
-                    places[is_sine] = names.index(name)
-                extras += places
-        numbers = (*(p[name] for name in cls.constants), *(p[name] for name in names))
-        return PackedShape(numbers, columns=len(names), degree=highest, extras=tuple(extras))
-
-    @classmethod
-    def _groups(cls, p: Parameters) -> dict[int, dict[int, list[tuple[str, bool, float]]]]:
-        """Return azimuthal order → k = (n - m)/2 → names of coefficients, whether sine, norms."""
-        groups: dict[int, dict[int, list[tuple[str, bool, float]]]] = {}
-        for name in p:
-            if _TERM.fullmatch(name):
-                n, m, sine, norm = cls.term(int(name[1:]))
-                groups.setdefault(m, {}).setdefault((n - m) // 2, []).append((name, sine, norm))
-        return groups
+    def numbers(cls, p: Parameters) -> tuple[Any, ...]:
+        """Return the even asphere's numbers, the constants, the coefficients and their table."""
+        found = {}
+        for name in filter(_TERM.fullmatch, p):
+            n, m, sine, _ = cls.term(int(name[1:]))
+            found[(n - m) // 2, m, sine] = p[name]
+        constants = (p[name] for name in cls.constants)
+        return *EvenAsphere.numbers(even_asphere(p)), *constants, *terms_of(found, cls.term is noll)
 
 
 def require_normalization_radius(given: Mapping[str, Any]) -> None:
@@ -190,7 +371,7 @@ class ZernikeStandard(ZernikeSag):
     """The polynomials are in Noll's order with unit variance over the disc ("standard")."""
 
     kind = "zernike_standard"
-    kernel = SurfaceKernel(*_KERNELS)
+    kernel = _KERNEL
     terms = 231
     term = staticmethod(noll)
 
@@ -200,7 +381,7 @@ class ZernikeFringe(ZernikeSag):
     """The polynomials are in the University of Arizona's order, 1 at the disc's edge ("fringe")."""
 
     kind = "zernike_fringe"
-    kernel = SurfaceKernel(*_KERNELS)
+    kernel = _KERNEL
     terms = FRINGE_TERMS
     term = staticmethod(fringe)
 
