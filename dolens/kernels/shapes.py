@@ -52,6 +52,47 @@ class Shape:
         _named.setdefault(self.name, self)
 
 
+@dataclass(frozen=True, eq=False)
+class PhaseFunctions:
+    """A law of deflection that is given by its phase has these functions.
+
+    Args:
+        name: of its kernels, for people.
+        phase: `(p, x, y)` gives m·φ (radians) and its gradient (1/mm).
+        phase_hessian: `(p, x, y)` gives the same, and the second derivatives xx, xy and yy (1/mm²).
+        parameters: `(cotangents, p, x, y, of_phase, of_x, of_y)` gives, by `put`, the cotangent of
+            each number.
+        layout: of p, as of a `Shape`; a series stands at `Code.LAW_COUNT`.
+    """
+
+    name: str
+    phase: Callable[..., Any]
+    phase_hessian: Callable[..., Any]
+    parameters: Callable[..., Any]
+    layout: tuple[int | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LawFunctions:
+    """Any other law of deflection, which knows nothing of the normal, has these functions.
+
+    Args:
+        name: of its kernels, for people.
+        forward: `(p, x, y, l, m, n, index, inverse, ratio, sense)` gives the direction behind and
+            what is added to the path (mm), from the point (mm), the direction and the index in
+            front, one over it, the ratio to the index behind, and the sense of the light behind.
+        adjoint: `(cotangents, p, x, y, l, m, n, index, inverse, ratio, sense, a, b, c, path)` gives
+            the cotangents of x, y, l, m, n and both indices, from those of the direction behind and
+            of the path; and by `put` those of its numbers.
+        layout: of p, as of a `Shape`; a series stands at `Code.LAW_COUNT`.
+    """
+
+    name: str
+    forward: Callable[..., Any]
+    adjoint: Callable[..., Any]
+    layout: tuple[int | None, ...]
+
+
 def shape_named(name: str) -> Shape:
     """Return the shape of this name; its surface's module has been imported."""
     return _named[name]

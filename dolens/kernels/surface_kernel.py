@@ -11,7 +11,7 @@ from itertools import count
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.kernels.shapes import Shape
+from dolens.kernels.shapes import LawFunctions, PhaseFunctions, Shape
 from dolens.kernels.table import Kind
 
 _codes = count(Kind.BY_SAG)
@@ -87,18 +87,16 @@ _law_by_code: dict[int, "LawKernel"] = {}
 
 @dataclass(frozen=True, eq=False)
 class LawKernel:
-    """A law has kernels for the CPU and for GPUs.
+    """A law has kernels for the CPU and for GPUs from its functions.
 
     Args:
-        cpu: the name of a module with `LawFunctions` of Numba as `KERNELS`.
-        cuda: the name of one with `LawFunctions` of Triton.
+        functions: which PyTorch, Numba and Triton share.
 
     Attributes:
         code: what marks this law's steps in a table; it is given anew in each process.
     """
 
-    cpu: str
-    cuda: str
+    functions: PhaseFunctions | LawFunctions
     code: int = field(init=False, default_factory=lambda: next(_law_codes))
 
     def __post_init__(self) -> None:
@@ -107,6 +105,5 @@ class LawKernel:
 
 @cache
 def law_kernels_of(code: int, device: str) -> Any:
-    """Return `KERNELS` of a law's module for `cpu` or `cuda`, imported when first needed."""
-    kernel = _law_by_code[code]
-    return import_module({"cpu": kernel.cpu, "cuda": kernel.cuda}[device]).KERNELS
+    """Return a law's kernels for `cpu` or `cuda`, made when first needed."""
+    return import_module(f"dolens.kernels.{device}.laws").kernels(_law_by_code[code].functions)

@@ -80,7 +80,9 @@ class Code:
     WAVE = 14  # row of `indices` that holds λ/2π, mm
     NUMBERS = 15  # where the law's numbers begin in the record
     FIGURES = 16  # of the aperture, in a row of numbers: where it begins in the record, or 0
-    ROW = 17  # length of a row
+    LAW_COUNT = 17  # numbers of the law's series
+    LAW_EXTRAS = 18  # offset of the law's table in `extras`
+    ROW = 19  # length of a row
 
 
 class Outline(IntEnum):

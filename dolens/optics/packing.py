@@ -121,8 +121,9 @@ def _look_up(system: OpticalSystem, sense: float, first: int, last: int, to_sens
             if law.law.kernel is None:
                 raise InputError(f"surface {number}: a {law.law.kind} has no kernel")
             kinds.add(law.law)
-            laws.append(LawForm(law.law.kernel.code, _sizes(own)))
-            of_laws += [value for value in own if value is not None]
+            sizes = _sizes(own.numbers)
+            laws.append(LawForm(law.law.kernel.code, own.count, own.extras, sizes))
+            of_laws += [value for value in own.numbers if value is not None]
     scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
     image = None
     if to_sensor and system.image is not None:

@@ -51,10 +51,14 @@ class LawForm(NamedTuple):
 
     Attributes:
         code: of its kernel.
+        count: as in `PackedShape`, and `extras`.
+        extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
     """
 
     code: int
+    count: int  # type: ignore[assignment]  # a tuple has a method of that name
+    extras: tuple[int, ...]
     sizes: tuple[torch.Size | None, ...]
 
 
@@ -265,6 +269,8 @@ class _Writer:
         # Planes, spheres and conics are there as aspheres: c, k, a2.
         self.constants += [0.0] * (3 - len(form.sizes))
         row[Code.LAW], row[Code.BASE] = law.code, form.kind
+        row[Code.LAW_COUNT], row[Code.LAW_EXTRAS] = law.count, len(self.extras)
+        self.extras += law.extras
         row[Code.NUMBERS] = len(self.constants) - row[Code.OFFSET]
         source = self.of_law[number - 1]
         for size in law.sizes:

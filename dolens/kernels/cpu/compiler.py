@@ -310,13 +310,13 @@ def _none(row: Sequence[int]) -> int:
 
 
 @dataclass(frozen=True)
-class LawFunctions:
+class LawBlocks:
     """A law of deflection has these block functions.
 
     Attributes:
         forward: carries a block of rays on a surface through the deflection.
         adjoint: takes cotangents from behind it to its front.
-        phase: of a phase: φ and its gradient; see `deflection`.
+        phase: of a phase: φ and its gradient; see `laws`.
         phase_hessian: φ, its gradient and its second derivatives.
         phase_parameters: cotangents of the law's numbers from those of φ and its gradient.
     """

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.cpu import compiler, jobs, shapes
-from dolens.kernels.cpu.arithmetic import phase_adjoint, phase_forward
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
     change_axes_forward,
@@ -21,7 +20,8 @@ from dolens.kernels.cpu.axes import (
     lens_axes_forward,
     sensor_forward,
 )
-from dolens.kernels.cpu.compiler import LawFunctions, Row, StepFunctions
+from dolens.kernels.cpu.compiler import LawBlocks, Row, StepFunctions
+from dolens.kernels.cpu.laws import phase_adjoint, phase_forward
 from dolens.kernels.cpu.layout import (
     ADJOINT,
     ASPHERE_HESSIAN,
@@ -202,7 +202,7 @@ def _compile_sag(
 
 def _compile_law(row: np.ndarray, extras: np.ndarray, real: str, derivatives: bool) -> None:
     """Compile a deflection's law, and for a phase the sag of the surface that it stands on."""
-    law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
+    law: LawBlocks = law_kernels_of(int(row[Code.LAW]), "cpu").of(row, extras)
     base = kernels_at(row, Code.BASE).of(row, extras)
     if base.sag is None:
         # Planes, spheres and conics are aspheres without coefficients: c, k and a2 = 0.

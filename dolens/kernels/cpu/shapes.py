@@ -197,9 +197,9 @@ def _unpacked(real: types.Type, sizes: Sequence[Size]) -> Any:
     return unpacked
 
 
-def _factory(
+def block_factory(
     function: Callable[..., Any],
-    block: Callable[[Any, Any], Callable[..., None]],
+    block: Callable[[types.Type, Any, Any], Callable[..., None]],
     name: str,
     sizes: tuple[Size, ...],
 ) -> Factory:
@@ -207,13 +207,13 @@ def _factory(
 
     Args:
         function: the shape's.
-        block: makes the block function from the compiled function and what reads p.
+        block: makes the block function from the real type, the compiled function and what reads p.
         name: of the kernel.
         sizes: of the parts of p.
     """
 
     def factory(real: types.Type) -> Callable[..., None]:
-        return block(_compiled(function, real), _unpacked(real, sizes))
+        return block(real, _compiled(function, real), _unpacked(real, sizes))
 
     factory.__name__, factory.__qualname__ = name, f"{name}{sizes}"
     factory.within = functions_within(function)  # type: ignore[attr-defined]
@@ -221,7 +221,7 @@ def _factory(
     return factory
 
 
-def _sag_block(sag: Any, unpacked: Any) -> Callable[..., None]:
+def _sag_block(real: types.Type, sag: Any, unpacked: Any) -> Callable[..., None]:
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
         for i in range(BLOCK):
@@ -231,7 +231,7 @@ def _sag_block(sag: Any, unpacked: Any) -> Callable[..., None]:
     return kernel
 
 
-def _hessian_block(sag_hessian: Any, unpacked: Any) -> Callable[..., None]:
+def _hessian_block(real: types.Type, sag_hessian: Any, unpacked: Any) -> Callable[..., None]:
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
         for i in range(BLOCK):
@@ -242,7 +242,7 @@ def _hessian_block(sag_hessian: Any, unpacked: Any) -> Callable[..., None]:
     return kernel
 
 
-def _parameters_block(parameters: Any, unpacked: Any) -> Callable[..., None]:
+def _parameters_block(real: types.Type, parameters: Any, unpacked: Any) -> Callable[..., None]:
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         w, p = carray(work, WORK_SIZE), unpacked(shifted(record, SHAPE))
         for i in range(BLOCK):
@@ -256,14 +256,34 @@ def _parameters_block(parameters: Any, unpacked: Any) -> Callable[..., None]:
 
 @cache
 def _step_functions(shape: Shape, sizes: tuple[Size, ...]) -> StepFunctions:
-    parts = (
-        (shape.sag, _sag_block, "sag"),
-        (shape.sag_hessian, _hessian_block, "hessian"),
-        (shape.parameters, _parameters_block, "parameters"),
+    made = (
+        block_factory(shape.sag, _sag_block, f"{shape.name}_sag", sizes),
+        block_factory(shape.sag_hessian, _hessian_block, f"{shape.name}_hessian", sizes),
+        block_factory(shape.parameters, _parameters_block, f"{shape.name}_parameters", sizes),
     )
-    made = (_factory(f, block, f"{shape.name}_{part}", sizes) for f, block, part in parts)
     numbers = sum(1 if size is None else size for size in sizes if not isinstance(size, tuple))
     return given_by_sag(*made, starts_on_conic=shape.starts_on_conic, numbers=numbers)
+
+
+def sizes_of(
+    layout: Sequence[int | None], row: Row, extras: Row, table: int = Code.EXTRAS
+) -> tuple[Size, ...]:
+    """Return the sizes of the parts of a layout; see `_unpacked`.
+
+    Args:
+        layout: of a shape or a law.
+        row: the step's codes.
+        extras: the lens's.
+        table: the place in the row of the offset of the table.
+    """
+
+    def size(place: int | None) -> Size:
+        if place != TABLE:
+            return None if place is None else int(row[place])
+        first = int(row[table])
+        return tuple(map(int, extras[first + 1 : first + 1 + int(extras[first])]))
+
+    return tuple(map(size, layout))
 
 
 class ShapeKernels(NamedTuple):
@@ -274,14 +294,7 @@ class ShapeKernels(NamedTuple):
 
     def of(self, row: Row, extras: Row) -> StepFunctions:
         """Return the functions of a step with this row of codes, and the lens's extras."""
-
-        def size(place: int | None) -> Size:
-            if place != TABLE:
-                return None if place is None else int(row[place])
-            first = int(row[Code.EXTRAS])
-            return tuple(map(int, extras[first + 1 : first + 1 + int(extras[first])]))
-
-        return _step_functions(self.shape, tuple(map(size, self.shape.layout)))
+        return _step_functions(self.shape, sizes_of(self.shape.layout, row, extras))
 
 
 kernels = ShapeKernels

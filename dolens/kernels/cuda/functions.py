@@ -39,20 +39,20 @@ class SagFunctions(NamedTuple):
     extras: Callable[[Row, Sequence[int]], list[int] | None] = _as_they_are
 
 
-class LawFunctions(NamedTuple):
-    """A law's module offers these functions, compiled by `triton.jit`, as `KERNELS`.
+class LawKernels(NamedTuple):
+    """A law has these functions, compiled by `triton.jit`.
 
-    Both take a pointer to the law's numbers, the step's row of codes, points x, y (mm) of the
-    block's rays, their directions l, m, n, the unit normal nx, ny, nz there, the index in front,
-    the ratio μ, λ/2π (mm), and the sense of the light behind.
+    Both take a pointer to the law's numbers, the step's row of codes, the extras, points x, y (mm)
+    of the block's rays, their directions l, m, n, the unit normal nx, ny, nz there, the index in
+    front, the ratio μ, λ/2π (mm), and the sense of the light behind.
 
     Attributes:
         forward: gives l, m, n behind, a number that is positive where the light goes on, and what
             is added to the path.
-        adjoint: takes a pointer to the sums of the law's numbers too, and at last the directions
-            behind, the cotangents a, b, c of these and that of the path, and which rays count;
-            it adds the cotangents of its numbers with `sums.add_sum`, and gives those of x and y,
-            of the direction in front, of the normal, and of the indices in front and behind.
+        adjoint: takes a pointer to the sums of the law's numbers too, behind the extras, and at
+            last the directions behind, the cotangents a, b, c of these and that of the path, and
+            which rays count; it adds the cotangents of its numbers, and gives those of x and y, of
+            the direction in front, of the normal, and of the indices in front and behind.
     """
 
     forward: Any
@@ -64,7 +64,7 @@ LAW_CODE, LAW_FORWARD, LAW_ADJOINT = (tl.constexpr(place) for place in range(3))
 LawShape = tuple[int, Any, Any, str]
 
 
-def law_of(code: int, functions: LawFunctions) -> LawShape:
+def law_of(code: int, functions: LawKernels) -> LawShape:
     """Return a law's code and functions as the kernels take them."""
     digest = "".join(getattr(function, "cache_key", "") for function in functions)
     return (code, *functions, digest)

@@ -1,6 +1,6 @@
 """A shape's functions are compiled for a block of rays; a series is a pointer and its length."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import FunctionType
 from typing import Any
@@ -90,18 +90,17 @@ def _constant(value: Any) -> Any:
     return tl.constexpr(value) if isinstance(value, int | float) else tl.tensor
 
 
-def _compiled(function: Callable[..., Any]) -> Any:
+def compiled(function: Callable[..., Any]) -> Any:
     """Return a shape's function, compiled by Triton where it is called."""
     return translated(function, _OPERATIONS, triton.jit, lambda literal: literal, _constant)
 
 
 @triton.jit
-def _unpacked(place, codes, extras, LAYOUT: tl.constexpr):
-    """Return p of a `Shape` from the place of its numbers."""
+def unpacked(place, codes, table, LAYOUT: tl.constexpr):
+    """Return p of a `Shape` from the place of its numbers, and that of its table."""
     p = ()
     for k in tl.static_range(len(LAYOUT)):
         if LAYOUT[k] == TABLE:
-            table = extras + tl.load(codes + EXTRAS)
             p = p + ((table + 1, tl.load(table)),)  # type: ignore[assignment]  # noqa: RUF005
         elif LAYOUT[k] == SINGLE:
             p = p + (tl.load(place),)  # type: ignore[assignment]  # noqa: RUF005
@@ -115,11 +114,11 @@ def _unpacked(place, codes, extras, LAYOUT: tl.constexpr):
 
 # The names in capitals are bound for each shape.
 def _sag(record, codes, extras, x, y):
-    return FUNCTION(_unpacked(record + SHAPE, codes, extras, LAYOUT), x, y)  # noqa: F821
+    return FUNCTION(unpacked(record + SHAPE, codes, extras + tl.load(codes + EXTRAS), LAYOUT), x, y)  # noqa: F821
 
 
 def _hessian(record, codes, extras, x, y):
-    p = _unpacked(record + SHAPE, codes, extras, LAYOUT)  # noqa: F821
+    p = unpacked(record + SHAPE, codes, extras + tl.load(codes + EXTRAS), LAYOUT)  # noqa: F821
     sx, sy, sxx, sxy, syy = FUNCTION(p, x, y)  # noqa: F821
     # A derivative may be one for all rays.
     return (
@@ -132,28 +131,31 @@ def _hessian(record, codes, extras, x, y):
 
 
 def _add_sums(record, codes, extras, sums, x, y, of_sag, of_x, of_y, alive):
-    p = _unpacked(record + SHAPE, codes, extras, LAYOUT)  # noqa: F821
+    p = unpacked(record + SHAPE, codes, extras + tl.load(codes + EXTRAS), LAYOUT)  # noqa: F821
     FUNCTION((sums + SHAPE, alive), p, x, y, of_sag, of_x, of_y)  # noqa: F821
+
+
+def bound(wrapper: Any, name: str, layout: Sequence[int | None], **functions: Any) -> Any:
+    """Return a function whose names in capitals are plain functions, compiled, and a layout."""
+    places: Any = tuple(SINGLE.value if place is None else int(place) for place in layout)
+    if not isinstance(unpacked, InterpretedFunction):
+        places = tl.constexpr(places)
+    made = {capitals: compiled(function) for capitals, function in functions.items()}
+    names = {**wrapper.__globals__, **made, "LAYOUT": places}
+    copy = FunctionType(wrapper.__code__, names, wrapper.__name__)
+    # Triton tells functions from each other by module and name.
+    copy.__module__, copy.__qualname__ = wrapper.__module__, name
+    return triton.jit(copy)
 
 
 @cache
 def kernels(shape: Shape) -> SagFunctions:
     """Return the three functions of a shape."""
-    layout: Any = tuple(SINGLE.value if place is None else int(place) for place in shape.layout)
-    if not isinstance(_unpacked, InterpretedFunction):
-        layout = tl.constexpr(layout)
-
-    def bound(wrapper: Any, function: Callable[..., Any], part: str) -> Any:
-        names = {**wrapper.__globals__, "FUNCTION": _compiled(function), "LAYOUT": layout}
-        copy = FunctionType(wrapper.__code__, names, wrapper.__name__)
-        # Triton tells functions from each other by module and name.
-        copy.__module__, copy.__qualname__ = __name__, f"{shape.name}_{part}"
-        return triton.jit(copy)
-
+    name, layout = shape.name, shape.layout
     return SagFunctions(
-        bound(_sag, shape.sag, "sag"),
-        bound(_hessian, shape.sag_hessian, "hessian"),
-        bound(_add_sums, shape.parameters, "sums"),
+        bound(_sag, f"{name}_sag", layout, FUNCTION=shape.sag),
+        bound(_hessian, f"{name}_hessian", layout, FUNCTION=shape.sag_hessian),
+        bound(_add_sums, f"{name}_sums", layout, FUNCTION=shape.parameters),
         starts_on_conic=shape.starts_on_conic,
     )
 

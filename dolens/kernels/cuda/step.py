@@ -188,7 +188,7 @@ def step(
             for k in tl.static_range(len(LAWS)):
                 if tl.load(codes + LAW) == LAWS[k][LAW_CODE]:
                     l, m, n, transmitted, added = LAWS[k][LAW_FORWARD](
-                        record + tl.load(codes + NUMBERS), codes, x, y, l, m, n,
+                        record + tl.load(codes + NUMBERS), codes, extras, x, y, l, m, n,
                         gx * inverse, gy * inverse, gz * inverse,
                         index, ratio, per_radian, tl.load(record + SENSE_BEHIND),
                     )  # fmt: skip

@@ -93,7 +93,7 @@ def step_adjoint(
             for k in tl.static_range(len(LAWS)):
                 if tl.load(codes + LAW) == LAWS[k][LAW_CODE]:
                     qx, qy, a, b, c, vx, vy, vz, of_front, of_behind = LAWS[k][LAW_ADJOINT](
-                        record + place, codes, sums + place, x, y, l, m, n, nx, ny, nz,
+                        record + place, codes, extras, sums + place, x, y, l, m, n, nx, ny, nz,
                         index, ratio, per_radian, tl.load(record + SENSE_BEHIND),
                         out_l, out_m, out_n, a, b, c, path, alive,
                     )  # fmt: skip

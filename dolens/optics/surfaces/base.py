@@ -76,7 +76,7 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
     """Return the numbers of a shape of plain functions for its kernels.
 
     Args:
-        layout: of its `Shape`.
+        layout: of its `Shape`, or of its law's functions.
         parts: what its functions take; a number that is no tensor is zero.
         more: further fields of `PackedShape`.
 
@@ -88,7 +88,7 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
     """
     if len(layout) != len(parts):
         raise InputError(f"a layout of {len(layout)} parts, where `numbers` gives {len(parts)}")
-    fields = {Code.COUNT: "count", Code.COLUMNS: "columns", Code.DEGREE: "degree"}
+    fields = {Code.COUNT: "count", Code.COLUMNS: "columns", Code.LAW_COUNT: "count"}
     numbers: list[Any] = []
     group = 1 if TABLE in layout else 4
     for place, part in zip(layout, parts, strict=True):
@@ -101,6 +101,12 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
             more[fields[place]] = len(part) + -len(part) % group
     tensors = (number if isinstance(number, Tensor) else None for number in numbers)
     return PackedShape(tuple(tensors), **more)
+
+
+def everywhere(numbers: Sequence[Any], x: Tensor, y: Tensor) -> list[Tensor]:
+    """Return numbers at all points x, y, where some are the same everywhere, or are no tensors."""
+    zero = torch.zeros_like(x + y)
+    return [n if isinstance(n, Tensor) and n.dim() >= zero.dim() else zero + n for n in numbers]
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
@@ -232,11 +238,7 @@ class Surface(nn.Module):
         if cls.shape is None:
             raise NotImplementedError
         *found, exists = cls.shape.sag(cls.numbers(p), x, y)
-        # A number may be the same everywhere, and no tensor.
-        zero = torch.zeros_like(x + y)
-        sag, sx, sy = (
-            n if isinstance(n, Tensor) and n.dim() >= zero.dim() else zero + n for n in found
-        )
+        sag, sx, sy = everywhere(found, x, y)
         return sag, sx, sy, exists.detach() if isinstance(exists, Tensor) else None
 
     @classmethod

@@ -6,13 +6,13 @@ ideal lens.  A law knows nothing of the shape but the normal at the point, so th
 every shape.
 """
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import LawKernel
-from dolens.optics.surfaces.base import Parameters, by_names
+from dolens.optics.surfaces.base import PackedShape, Parameters, by_names, packed_as
 
 Number = float | Tensor
 Vector = tuple[Tensor, Tensor, Tensor]
@@ -103,15 +103,23 @@ class Law(nn.Module):
         raise NotImplementedError
 
     @classmethod
-    @by_names
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
-        """Return the numbers that `kernel` takes, in its order.
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
+        """Return what the functions of `kernel` take; see `Surface.numbers`.
 
         Args:
             p: parameters.
             forward: as of `Travel`.
         """
         return tuple(p.values())
+
+    @classmethod
+    @by_names
+    def packed(cls, p: Parameters, forward: bool) -> PackedShape:
+        """Return the numbers that `kernel` takes, in its order; the arguments are those of
+        `numbers`.
+        """
+        assert cls.kernel is not None  # its layout is asked for
+        return packed_as(cls.kernel.functions.layout, cls.numbers(p, forward))
 
     @classmethod
     def paraxial_power(cls, p: Parameters) -> ParaxialPower:

@@ -17,19 +17,18 @@ length is meant in air: the power φ is 1/f in any media, as in Zemax.
 """
 
 from collections.abc import Mapping
-
-import torch
-from torch import Tensor
+from typing import Any
 
 from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
+from dolens.kernels.operations import Number, divide, put, sqrt, where
+from dolens.kernels.shapes import LawFunctions
 from dolens.kernels.surface_kernel import LawKernel
-from dolens.optics.surfaces.base import Parameters
+from dolens.optics.surfaces.base import PackedShape, Parameters
 from dolens.optics.surfaces.deflection import (
     Deflected,
     Law,
     Media,
-    Number,
     ParaxialPower,
     Travel,
     Vector,
@@ -38,13 +37,92 @@ from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.registry import register_surface
 
 
+def ideal_lens_forward(
+    p: Any, x: Number, y: Number, l: Number, m: Number, n: Number,  # noqa: E741
+    index: Number, inverse: Number, ratio: Number, sense: Number,
+) -> tuple[Number, Number, Number, Number]:  # fmt: skip
+    """Return the direction behind, and the path that is added; see the module.
+
+    Slopes count along the light's own sense.
+    """
+    power, vergence = p
+    bend, turn = power * ratio * inverse, vergence * inverse
+    size = where(n < 0.0, -n, n)
+    q = divide(1.0, where(size > GRAZING, size, GRAZING))
+    ux, uy = l * q, m * q
+    vx, vy = ratio * ux - x * bend, ratio * uy - y * bend
+    q_behind = sqrt(1.0 + vx * vx + vy * vy)
+    wx, wy = ux - x * turn, uy - y * turn
+    across = wx * wx + wy * wy
+    arrived = divide(x * (ux + wx) + y * (uy + wy), sqrt(1.0 + across) + q)
+    left = divide(
+        x * (vx + ratio * wx) + y * (vy + ratio * wy), sqrt(1.0 + ratio * ratio * across) + q_behind
+    )
+    cosine = divide(1.0, q_behind)
+    return vx * cosine, vy * cosine, sense * cosine, index * (divide(left, ratio) - arrived)
+
+
+def ideal_lens_adjoint(
+    cotangents: Any, p: Any, x: Number, y: Number, l: Number, m: Number, n: Number,  # noqa: E741
+    index: Number, inverse: Number, ratio: Number, sense: Number,
+    a: Number, b: Number, c: Number, path: Number,
+) -> tuple[Number, Number, Number, Number, Number, Number, Number]:  # fmt: skip
+    """Return the cotangents of x, y, the direction and both indices: the chain rule, line by line
+    from the last line of `ideal_lens_forward`.
+    """
+    power, vergence = p
+    per_behind = ratio * inverse
+    behind, bend, turn = divide(index, ratio), power * per_behind, vergence * inverse
+    q = divide(1.0, where(n < 0.0, -n, n))
+    ux, uy = l * q, m * q
+    vx, vy = ratio * ux - x * bend, ratio * uy - y * bend
+    q2 = sqrt(1.0 + vx * vx + vy * vy)
+    wx, wy = ux - x * turn, uy - y * turn
+    across = wx * wx + wy * wy
+    q0, q02 = sqrt(1.0 + across), sqrt(1.0 + ratio * ratio * across)
+    first, second = divide(1.0, q0 + q), divide(1.0, q02 + q2)
+    arrived = (x * (ux + wx) + y * (uy + wy)) * first
+    left = (x * (vx + ratio * wx) + y * (vy + ratio * wy)) * second
+
+    cosine = divide(1.0, q2)
+    of_s1, of_s2 = -path * index * first, path * behind * second
+    of_q2 = -(a * vx + b * vy + c * sense) * cosine * cosine - of_s2 * left
+    # Twice the cotangent of w².
+    of_across = -divide(of_s1 * arrived, q0) - divide(of_s2 * left * ratio * ratio, q02)
+    of_wx = (of_s1 + of_s2 * ratio) * x + of_across * wx
+    of_wy = (of_s1 + of_s2 * ratio) * y + of_across * wy
+    of_vx = a * cosine + of_s2 * x + of_q2 * vx * cosine
+    of_vy = b * cosine + of_s2 * y + of_q2 * vy * cosine
+    # w = u - r·V/n, and u' = μ·u - r·φ/n'.
+    of_turn, of_bend = -(x * of_wx + y * of_wy), -(x * of_vx + y * of_vy)
+    put(cotangents, 0, of_bend * per_behind)
+    put(cotangents, 1, of_turn * inverse)
+    of_ratio = of_s2 * (x * wx + y * wy) - divide(of_s2 * left * ratio * across, q02)
+    of_ratio = of_ratio + ux * of_vx + uy * of_vy
+    of_ux = of_s1 * x + of_wx + ratio * of_vx
+    of_uy = of_s1 * y + of_wy + ratio * of_vy
+    of_q = l * of_ux + m * of_uy - of_s1 * arrived
+    return (
+        of_s1 * (ux + wx) + of_s2 * (vx + ratio * wx) - turn * of_wx - bend * of_vx,
+        of_s1 * (uy + wy) + of_s2 * (vy + ratio * wy) - turn * of_wy - bend * of_vy,
+        of_ux * q,
+        of_uy * q,
+        -of_q * q * q * sense,
+        (of_ratio * ratio - of_turn * turn) * inverse - path * arrived,
+        path * left - (of_ratio * ratio + of_bend * bend) * per_behind,
+    )
+
+
+IDEAL_LENS = LawFunctions("ideal_lens", ideal_lens_forward, ideal_lens_adjoint, (None, None))
+
+
 class IdealLens(Law):
     """The law of the ideal lens, in a plane: parameters `power` φ (1/mm) and `vergence` V (1/mm,
     zero if it is not there).
     """
 
     kind = "paraxial lens"
-    kernel = LawKernel("dolens.kernels.cpu.ideal_lens", "dolens.kernels.cuda.ideal_lens")
+    kernel = LawKernel(IDEAL_LENS)
     rotational = True
 
     @classmethod
@@ -66,34 +144,23 @@ class IdealLens(Law):
         media: Media,
         travel: Travel,
     ) -> Deflected:
-        """Change slopes and path; see the module.  Slopes count along the light's own sense."""
-        x, y, _ = point
-        l, m, n = direction  # noqa: E741
-        before, behind = media.before, media.behind
-        power, ratio = p["power"], before / behind
-        q = 1.0 / n.abs().clamp(min=GRAZING)
-        ux, uy = l * q, m * q
-        vx, vy = ratio * ux - x * (power / behind), ratio * uy - y * (power / behind)
-        q_behind = torch.sqrt(1.0 + vx * vx + vy * vy)
-        turn = cls.arriving(p, travel.forward) / before
-        wx, wy = ux - x * turn, uy - y * turn
-        across = wx * wx + wy * wy
-        centre = torch.sqrt(1.0 + across)
-        centre_behind = torch.sqrt(1.0 + (ratio * ratio) * across)
-        arrived = (x * (ux + wx) + y * (uy + wy)) / (centre + q)
-        left = (x * (vx + ratio * wx) + y * (vy + ratio * wy)) / (centre_behind + q_behind)
-        return Deflected(
-            vx / q_behind,
-            vy / q_behind,
-            travel.sense / q_behind,
-            None,
-            behind * left - before * arrived,
-        )
+        """Change slopes and path; see the module."""
+        before, (x, y, _) = media.before, point
+        *found, path = ideal_lens_forward(
+            cls.numbers(p, travel.forward), x, y, *direction,
+            before, 1.0 / before, before / media.behind, travel.behind,
+        )  # fmt: skip
+        return Deflected(*found, None, path)
 
     @classmethod
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor, ...]:
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
         """Return the power and the reduced vergence of the light that arrives."""
-        return p["power"], torch.as_tensor(cls.arriving(p, forward)).to(p["power"])
+        return p["power"], cls.arriving(p, forward)
+
+    @classmethod
+    def packed(cls, p: Parameters, forward: bool) -> PackedShape:
+        """Return these; backwards the vergence is computed, and not stored."""
+        return super().packed(p, forward)
 
     @classmethod
     def paraxial_power(cls, p: Parameters) -> ParaxialPower:

@@ -25,23 +25,42 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
-from dolens.kernels.operations import safe_sqrt
+from dolens.kernels.operations import (
+    Number,
+    divide,
+    fma,
+    horner,
+    horner_second,
+    length,
+    put,
+    put_powers,
+    safe_sqrt,
+    zero,
+)
+from dolens.kernels.shapes import TABLE, PhaseFunctions
 from dolens.kernels.surface_kernel import LawKernel
-from dolens.optics.surfaces.base import Parameters, by_names, tensor_of
+from dolens.kernels.table import Code
+from dolens.optics.surfaces.base import Parameters, everywhere, tensor_of
 from dolens.optics.surfaces.deflection import (
     Deflected,
     Law,
     Media,
-    Number,
     ParaxialPower,
     Travel,
     Vector,
 )
 from dolens.optics.surfaces.registry import order_of, order_pattern
-from dolens.optics.surfaces.xy_polynomial import monomial_powers
+from dolens.optics.surfaces.xy_polynomial import (
+    horner_order,
+    monomial_powers,
+    polynomial,
+    polynomial_second,
+    put_polynomial,
+)
 
 # Path in mm for a radian of phase, over the wavelength in nm.
 _PATH = 1e-6 / (2.0 * math.pi)
+_TURN = 2.0 * math.pi
 _TERM = order_pattern("p")
 
 
@@ -93,7 +112,11 @@ class Phase(Law):
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return m·φ (radians), and m·∂φ/∂x and m·∂φ/∂y (1/mm), at points x, y (mm)."""
-        raise NotImplementedError
+        functions = cls.kernel and cls.kernel.functions
+        if not isinstance(functions, PhaseFunctions):
+            raise NotImplementedError
+        phase, gx, gy = everywhere(functions.phase(cls.numbers(p), x, y), x, y)
+        return phase, gx, gy
 
     @classmethod
     def deflect(
@@ -142,6 +165,36 @@ def register_phase(phase: type[_Phase]) -> type[_Phase]:
     return phase
 
 
+def grating_phase(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number]:
+    """Return 2π·m·G·y and its gradient."""
+    order, grooves = p
+    slope = _TURN * order * grooves
+    return slope * y, zero(x), slope + zero(x)
+
+
+def grating_hessian(
+    p: Any, x: Number, y: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Return 2π·m·G·y, its gradient, and second derivatives of zero."""
+    order, grooves = p
+    slope = _TURN * order * grooves
+    return slope * y, zero(x), slope + zero(x), zero(x), zero(x), zero(x)
+
+
+def grating_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_phase: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangent of the grooves; the order is no variable."""
+    order, _ = p
+    put(cotangents, 0, zero(x))
+    put(cotangents, 1, _TURN * order * (of_phase * y + of_y))
+
+
+GRATING = PhaseFunctions(
+    "grating", grating_phase, grating_hessian, grating_parameters, (None, None)
+)
+
+
 @register_phase
 class Grating(Phase):
     """The phase of straight grooves parallel to x, equally spaced in y: φ = 2π·G·y with G grooves
@@ -150,7 +203,7 @@ class Grating(Phase):
 
     type = "grating"
     kind = "grating"
-    kernel = LawKernel("dolens.kernels.cpu.phases.grating", "dolens.kernels.cuda.phases.grating")
+    kernel = LawKernel(GRATING)
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -160,16 +213,7 @@ class Grating(Phase):
         return ["order", "grooves"]
 
     @classmethod
-    def phase_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return 2π·m·G·y and its gradient."""
-        slope = (2.0 * math.pi) * p["order"] * p["grooves"]
-        return slope * y, torch.zeros_like(y), slope + torch.zeros_like(y)
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor, ...]:
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
         """Return order and grooves."""
         return p["order"], p["grooves"]
 
@@ -179,13 +223,65 @@ class Grating(Phase):
         return ParaxialPower(0.0, 0.0)
 
 
+def radial_phase(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number]:
+    """Return the phase m·q·h(q) with q = ρ² and h = p2 + p4·q + ..., and its gradient."""
+    order, radius, series = p
+    inverse = divide(1.0, radius)
+    u, v = inverse * x, inverse * y
+    q = fma(u, u, v * v)
+    h, d = horner(series, q)
+    twice = 2.0 * order * inverse * fma(q, d, h)
+    return order * (q * h), twice * u, twice * v
+
+
+def radial_hessian(
+    p: Any, x: Number, y: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Return phase, gradient and second derivatives: φ'' = m(2h' + q·h'')."""
+    order, radius, series = p
+    inverse = divide(1.0, radius)
+    u, v = inverse * x, inverse * y
+    q = fma(u, u, v * v)
+    h, d, e = horner_second(series, q)
+    twice = 2.0 * order * inverse * fma(q, d, h)
+    slope = twice * inverse
+    second = 8.0 * order * inverse * inverse * fma(q, e, d)
+    return (
+        order * (q * h),
+        twice * u,
+        twice * v,
+        slope + second * u * u,
+        second * u * v,
+        slope + second * v * v,
+    )
+
+
+def radial_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_phase: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of p2, p4, ...; order and radius are no variables."""
+    order, radius, series = p
+    inverse = divide(1.0, radius)
+    u, v = inverse * x, inverse * y
+    q = fma(u, u, v * v)
+    put(cotangents, 0, zero(x))
+    put(cotangents, 1, zero(x))
+    of_slope = 2.0 * inverse * (u * of_x + v * of_y)
+    put_powers(cotangents, 2, length(series), order + zero(x), q, of_phase, of_slope, 1, 1)
+
+
+RADIAL = PhaseFunctions(
+    "radial_phase", radial_phase, radial_hessian, radial_parameters, (None, None, Code.LAW_COUNT)
+)
+
+
 @register_phase
 class RadialPhase(Phase):
     """The phase is φ = p2·ρ² + p4·ρ⁴ + ... with ρ = r/norm_radius; coefficients in radians."""
 
     type = "radial"
     kind = "radial phase"
-    kernel = LawKernel("dolens.kernels.cpu.phases.radial", "dolens.kernels.cuda.phases.radial")
+    kernel = LawKernel(RADIAL)
     rotational = True
 
     @classmethod
@@ -203,33 +299,12 @@ class RadialPhase(Phase):
             powers.append(power)
         return ["order", "norm_radius", *(f"p{power}" for power in sorted(powers))]
 
-    @staticmethod
-    def coefficients(p: Parameters) -> list[Tensor | None]:
-        """Return p2, p4, ... up to the highest power that is there; None: zero."""
+    @classmethod
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
+        """Return order, radius of normalisation, and p2, p4, ... up to the highest."""
         highest = max((int(name[1:]) for name in p if _TERM.fullmatch(name)), default=0)
-        return [p.get(f"p{power}") for power in range(2, highest + 1, 2)]
-
-    @classmethod
-    def phase_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the phase and its gradient by Horner's rule in q = ρ²."""
-        inverse = 1.0 / p["norm_radius"]
-        u, v = inverse * x, inverse * y
-        q = u * u + v * v
-        # φ = q·h(q).
-        h, slope = torch.zeros_like(q), torch.zeros_like(q)
-        for coefficient in reversed(cls.coefficients(p)):
-            slope = torch.addcmul(h, slope, q)
-            h = h * q if coefficient is None else torch.addcmul(coefficient, h, q)
-        twice = (2.0 * p["order"] * inverse) * torch.addcmul(h, slope, q)
-        return p["order"] * (q * h), twice * u, twice * v
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
-        """Return order, radius of normalisation, p2, p4, ..."""
-        return (p["order"], p["norm_radius"], *cls.coefficients(p))
+        series = tuple(p.get(f"p{power}", 0.0) for power in range(2, highest + 1, 2))
+        return p["order"], p["norm_radius"], series
 
     @classmethod
     def paraxial_power(cls, p: Parameters) -> ParaxialPower:
@@ -243,6 +318,47 @@ class RadialPhase(Phase):
         return _PATH * p["order"] * p.get("p4", 0.0) / p["norm_radius"] ** 4
 
 
+def xy_phase(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number]:
+    """Return the phase and its gradient."""
+    order, radius, a, table = p
+    inverse = divide(1.0, radius)
+    value, du, dv = polynomial(a, table, inverse * x, inverse * y)
+    slope = order * inverse
+    return order * value, slope * du, slope * dv
+
+
+def xy_hessian(
+    p: Any, x: Number, y: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Return phase, gradient and second derivatives."""
+    order, radius, a, table = p
+    inverse = divide(1.0, radius)
+    value, du, dv, uu, uv, vv = polynomial_second(a, table, inverse * x, inverse * y)
+    slope = order * inverse
+    second = slope * inverse
+    return order * value, slope * du, slope * dv, second * uu, second * uv, second * vv
+
+
+def xy_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_phase: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of the coefficients; order and radius are no variables."""
+    order, radius, a, table = p
+    put(cotangents, 0, zero(x))
+    put(cotangents, 1, zero(x))
+    inverse = divide(1.0, radius)
+    slope = order * inverse
+    put_polynomial(
+        cotangents, 2, a, table, inverse * x, inverse * y,
+        order * of_phase, slope * of_x, slope * of_y,
+    )  # fmt: skip
+
+
+XY_PHASE = PhaseFunctions(
+    "xy_phase", xy_phase, xy_hessian, xy_parameters, (None, None, Code.LAW_COUNT, TABLE)
+)
+
+
 @register_phase
 class XYPhase(Phase):
     """The phase is φ = Σ a_ij·(x/R)^i·(y/R)^j with R = norm_radius; coefficients, in radians, are
@@ -251,7 +367,7 @@ class XYPhase(Phase):
 
     type = "xy"
     kind = "XY phase"
-    kernel = LawKernel("dolens.kernels.cpu.phases.xy", "dolens.kernels.cuda.phases.xy")
+    kernel = LawKernel(XY_PHASE)
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -259,51 +375,16 @@ class XYPhase(Phase):
         names = [str(key) for key in keys if monomial_powers(str(key)) is not None]
         return ["order", "norm_radius", *names]
 
-    @staticmethod
-    def coefficients(p: Parameters) -> list[Tensor | None]:
-        """Return the coefficients of x, y, x², xy, y², x³, ...: all of each degree up to the
-        highest, i falling; None: zero.
+    @classmethod
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
+        """Return order, radius of normalisation, the coefficients, and the table of their
+        powers.
         """
-        found = {
-            powers: value
-            for name, value in p.items()
-            if (powers := monomial_powers(name)) is not None
-        }
-        degree = max((i + j for i, j in found), default=0)
-        return [found.get((d - j, j)) for d in range(1, degree + 1) for j in range(d + 1)]
-
-    @classmethod
-    def phase_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the phase and its gradient by Horner's rule in x within one in y."""
-        inverse = 1.0 / p["norm_radius"]
-        u, v = inverse * x, inverse * y
-        found = {
-            powers: value
-            for name, value in p.items()
-            if (powers := monomial_powers(name)) is not None
-        }
-        degree = max((i + j for i, j in found), default=0)
-        zero = torch.zeros_like(u)
-        value, du, dv = zero, zero, zero
-        for j in range(degree, -1, -1):
-            row, slope = zero, zero
-            for i in range(degree - j, -1, -1):
-                a = found.get((i, j))
-                slope = torch.addcmul(row, slope, u)
-                row = row * u if a is None else torch.addcmul(a, row, u)
-            dv = torch.addcmul(value, dv, v)
-            value = torch.addcmul(row, value, v)
-            du = torch.addcmul(slope, du, v)
-        scale = p["order"] * inverse
-        return p["order"] * value, scale * du, scale * dv
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
-        """Return order, radius of normalisation, and the coefficients of `coefficients`."""
-        return (p["order"], p["norm_radius"], *cls.coefficients(p))
+        coefficients, table = horner_order(
+            {powers: a for n, a in p.items() if (powers := monomial_powers(n)) is not None}
+        )
+        # The table's first number is a polynomial surface's own.
+        return p["order"], p["norm_radius"], coefficients, (0, *table)
 
     @classmethod
     def paraxial_power(cls, p: Parameters) -> ParaxialPower:

@@ -1,26 +1,86 @@
 """Phases that are sums of Zernike polynomials: wavefront errors that were measured, or are wanted.
 
-Zernike polynomials are polynomials in x and y, so that the kernels are those of an XY phase: its
+Zernike polynomials are polynomials in x and y: paraxial properties are those of an XY phase, whose
 coefficients are sums of these ones.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import Parameters
-from dolens.optics.surfaces.deflection import Number, ParaxialPower
+from dolens.kernels.operations import Number, divide, put, zero
+from dolens.kernels.shapes import TABLE, PhaseFunctions
+from dolens.kernels.surface_kernel import LawKernel
+from dolens.kernels.table import Code
+from dolens.optics.surfaces.base import PackedShape, Parameters
+from dolens.optics.surfaces.deflection import ParaxialPower
 from dolens.optics.surfaces.phase import Phase, XYPhase, register_phase
 from dolens.optics.surfaces.registry import order_of, order_pattern
-from dolens.optics.surfaces.zernike import FRINGE_TERMS, ZernikeTerm, fringe, jacobi, noll
+from dolens.optics.surfaces.zernike import (
+    FRINGE_TERMS,
+    ZernikeTerm,
+    fringe,
+    noll,
+    put_terms,
+    terms_of,
+    terms_second,
+    terms_slopes,
+)
 
 _TERM = order_pattern("z")
 _RADIANS = 2.0 * math.pi
+
+
+def zernike_phase(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number]:
+    """Return the phase and its gradient."""
+    order, radius, terms, table = p
+    inverse = divide(1.0, radius)
+    value, du, dv = terms_slopes(terms, table, inverse * x, inverse * y, radius)
+    scale = _RADIANS * order
+    slope = scale * inverse
+    return scale * value, slope * du, slope * dv
+
+
+def zernike_phase_hessian(
+    p: Any, x: Number, y: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Return phase, gradient and second derivatives."""
+    order, radius, terms, table = p
+    inverse = divide(1.0, radius)
+    value, du, dv, uu, uv, vv = terms_second(terms, table, inverse * x, inverse * y, radius)
+    scale = _RADIANS * order
+    slope = scale * inverse
+    second = slope * inverse
+    return scale * value, slope * du, slope * dv, second * uu, second * uv, second * vv
+
+
+def zernike_phase_parameters(
+    cotangents: Any, p: Any, x: Number, y: Number, of_phase: Number, of_x: Number, of_y: Number
+) -> None:
+    """Give the cotangents of the coefficients; order and radius are no variables."""
+    order, radius, _, table = p
+    put(cotangents, 0, zero(x))
+    put(cotangents, 1, zero(x))
+    inverse = divide(1.0, radius)
+    scale = _RADIANS * order
+    slope = scale * inverse
+    put_terms(
+        cotangents, 2, table, inverse * x, inverse * y, radius,
+        scale * of_phase, slope * of_x, slope * of_y,
+    )  # fmt: skip
+
+
+ZERNIKE_PHASE = PhaseFunctions(
+    "zernike_phase",
+    zernike_phase,
+    zernike_phase_hessian,
+    zernike_phase_parameters,
+    (None, None, Code.LAW_COUNT, TABLE),
+)
 
 
 class ZernikePhase(Phase):
@@ -30,7 +90,7 @@ class ZernikePhase(Phase):
     Polynomials go on beyond the radius.  A constant phase, which no ray sees, is left out.
     """
 
-    kernel = XYPhase.kernel
+    kernel = LawKernel(ZERNIKE_PHASE)
     terms: ClassVar[int]
     term: ClassVar[Callable[[int], ZernikeTerm]]
 
@@ -45,37 +105,28 @@ class ZernikePhase(Phase):
         return ["order", "norm_radius", *(f"z{number}" for number in numbers)]
 
     @classmethod
-    def phase_and_gradient(
-        cls, p: Parameters, x: Tensor, y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the phase and its gradient, by the recurrence of Jacobi polynomials."""
-        inverse = 1.0 / p["norm_radius"]
-        u, v = inverse * x, inverse * y
-        q = torch.addcmul(u * u, v, v)
-        phase, du, dv = torch.zeros_like(q), torch.zeros_like(q), torch.zeros_like(q)
+    def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:
+        """Return order, radius of normalisation, the coefficients, and their table.
+
+        The coefficient of the constant makes the phase zero in the middle, where P_k = (-1)^k.
+        """
+        found: dict[tuple[int, int, bool], Any] = {}
+        middle = 0.0
         for name, value in p.items():
             match = _TERM.fullmatch(name)
             if match is None:
                 continue
             n, m, sine, norm = cls.term(int(match[1]))
-            *_, (radial, slope) = jacobi(q, m, (n - m) // 2 + 1)
-            # ρ^m·cos(mφ) or ρ^m·sin(mφ), and its derivatives.
-            power, below = _powers(u, v, m)
-            angular, along, across = (
-                (power[1], below[1], below[0]) if sine else (power[0], below[0], -below[1])
-            )
-            coefficient = norm * value
-            middle = (-1.0) ** (n // 2) if m == 0 else 0.0
-            phase = phase + coefficient * (angular * radial - middle)
-            du = du + coefficient * (m * along * radial + 2.0 * u * angular * slope)
-            dv = dv + coefficient * (m * across * radial + 2.0 * v * angular * slope)
-        scale = _RADIANS * p["order"]
-        return scale * phase, (scale * inverse) * du, (scale * inverse) * dv
+            found[(n - m) // 2, m, sine] = value
+            if m == 0 and n > 0:
+                middle = middle + (-1.0) ** (n // 2) * norm * value
+        found[0, 0, False] = -1.0 * middle
+        return p["order"], p["norm_radius"], *terms_of(found, cls.term is noll)
 
     @classmethod
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
-        """Return the numbers of the XY phase that is the same: order, radius, coefficients."""
-        return XYPhase.packed(cls.as_xy(p), forward)
+    def packed(cls, p: Parameters, forward: bool) -> PackedShape:
+        """Return these; one is computed, and not stored."""
+        return super().packed(p, forward)
 
     @classmethod
     def as_xy(cls, p: Parameters) -> dict[str, Tensor]:
@@ -111,16 +162,6 @@ class ZernikePhase(Phase):
             InputError: a term that no Seidel sum describes is not zero.
         """
         return XYPhase.fourth_order_path(cls.as_xy(p))
-
-
-def _powers(u: Tensor, v: Tensor, m: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Return real and imaginary part of (u + i·v)^m, and of the next lower power (0 for m = 0)."""
-    real, imaginary = torch.ones_like(u), torch.zeros_like(u)
-    below = (torch.zeros_like(u), torch.zeros_like(u))
-    for _ in range(m):
-        below = (real, imaginary)
-        real, imaginary = real * u - imaginary * v, imaginary * u + real * v
-    return (real, imaginary), below
 
 
 @cache

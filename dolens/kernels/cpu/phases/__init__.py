@@ -1,1 +1,0 @@
-"""Each module here has the block functions of a phase."""

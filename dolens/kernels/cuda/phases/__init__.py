@@ -1,1 +1,0 @@
-"""Each module here has the Triton functions of a phase."""
