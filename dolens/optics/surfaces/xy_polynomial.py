@@ -116,8 +116,8 @@ def put_polynomial(
             if j > 0:
                 v_below = v
                 v = v * y
-        of_a = of_p * (u * v) + of_x * (number(i, x) * u_below * v)
-        put(cotangents, place + t, of_a + of_y * (number(j, x) * u * v_below))
+        of_a = of_p * u * v + of_x * number(i, x) * u_below * v
+        put(cotangents, place + t, of_a + of_y * number(j, x) * u * v_below)
         u_below = u
         u = u * x
 
