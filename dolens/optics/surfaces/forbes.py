@@ -42,7 +42,7 @@ from dolens.optics.surfaces.conic import (
 )
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
-from dolens.optics.surfaces.zernike import require_normalization_radius
+from dolens.optics.surfaces.zernike import jacobi_step, require_normalization_radius
 
 _TERM = order_pattern("q", 0)
 # The square of the smallest cosine that the departure along the normal is divided by.
@@ -52,19 +52,12 @@ STEEPEST = 1e-12
 def _step(k: Number, best_fit: Number) -> tuple[Number, Number, Number]:
     """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), beginning with P_0 = 1.
 
-    Those of Q_con (`best_fit` is 0.0) are Jacobi polynomials P_k^(0, 4)(2q - 1), see
-    `dolens.optics.surfaces.zernike`; the auxiliary ones of Q_bfs (1.0) have P_(-1) = -1.
+    Those of Q_con (`best_fit` is 0.0) are Jacobi polynomials P_k^(0, 4)(2q - 1); the auxiliary ones
+    of Q_bfs (1.0) have P_(-1) = -1.
     """
     fits = best_fit > 0.0
-    inverse = divide(1.0, 4.0 * k * (k + 4.0) * (k + 1.0))
-    here, both = 2.0 * k + 3.0, 2.0 * k + 4.0
-    slope = here * both * (2.0 * k + 2.0) * inverse
-    gamma = 2.0 * (k - 1.0) * (k + 3.0) * both * inverse
-    return (
-        where(fits, -4.0, 2.0 * slope),
-        where(fits, 2.0, -16.0 * here * inverse - slope),
-        where(fits, 1.0, gamma),
-    )
+    alpha, beta, gamma = jacobi_step(k, 4.0)
+    return where(fits, -4.0, alpha), where(fits, 2.0, beta), where(fits, 1.0, gamma)
 
 
 def _total(b: Series, q: Number, like: Number, best_fit: Number) -> tuple[Number, Number]:

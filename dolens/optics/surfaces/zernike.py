@@ -98,8 +98,8 @@ def fringe(number: int) -> ZernikeTerm:
 _TERM = order_pattern("z")
 
 
-def _step(k: Number, m: Number) -> tuple[Number, Number, Number]:
-    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), for k ≥ 1.
+def jacobi_step(k: Number, m: Number) -> tuple[Number, Number, Number]:
+    """Return (α, β, γ) of P_k^(0, m)(2q - 1) = (α·q + β)·P_(k-1) - γ·P_(k-2), for k ≥ 1.
 
     Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 22.7.1, at x = 2q - 1.
     """
@@ -141,7 +141,7 @@ def terms_slopes(
                 c1, s1 = c, s
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
-            alpha, beta, gamma = _step(number(k, like), m)
+            alpha, beta, gamma = jacobi_step(number(k, like), m)
             factor = fma(alpha, q, beta)
             above = fma(factor, value, -gamma * value_below)
             slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
@@ -180,7 +180,7 @@ def terms_second(
                 c2, s2, c1, s1 = c1, s1, c, s
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
-            alpha, beta, gamma = _step(number(k, like), m)
+            alpha, beta, gamma = jacobi_step(number(k, like), m)
             factor = fma(alpha, q, beta)
             above = fma(factor, value, -gamma * value_below)
             slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
@@ -228,7 +228,7 @@ def put_terms(
                 c1, s1 = c, s
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
-            alpha, beta, gamma = _step(number(k, like), m)
+            alpha, beta, gamma = jacobi_step(number(k, like), m)
             factor = fma(alpha, q, beta)
             above = fma(factor, value, -gamma * value_below)
             slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
@@ -386,27 +386,13 @@ class ZernikeFringe(ZernikeSag):
     term = staticmethod(fringe)
 
 
-@cache
-def recurrence(k: int, m: int) -> tuple[float, float, float]:
-    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), for k ≥ 1.
-
-    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 22.7.1, at x = 2q - 1.
-    """
-    if k == 1:
-        return m + 2.0, -(m + 1.0), 0.0
-    lower, here, both = 2 * k + m - 2, 2 * k + m - 1, 2 * k + m
-    scale = 2 * k * (k + m) * lower
-    slope = here * both * lower / scale
-    return 2.0 * slope, -here * m * m / scale - slope, 2 * (k - 1) * (k + m - 1) * both / scale
-
-
 def jacobi(q: Tensor, m: int, count: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield P_k^(0, m)(2q - 1) and its derivative in q, for k = 0, 1, ..., count - 1."""
     value, slope = torch.ones_like(q), torch.zeros_like(q)
     lower, lower_slope = torch.zeros_like(q), torch.zeros_like(q)
     for k in range(count):
         if k > 0:
-            a, b, c = recurrence(k, m)
+            a, b, c = jacobi_step(float(k), float(m))
             factor = a * q + b
             value, lower, slope, lower_slope = (
                 factor * value - c * lower,
