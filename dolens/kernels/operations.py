@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from dolens.kernels.limits import TINY
+from dolens.kernels.table import TINY
 
 Number = Any  # a tensor; in kernels a ray's number
 Series = Any  # a tuple of numbers; in kernels, places of numbers

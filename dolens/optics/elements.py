@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 from dolens.optics.rays import Components, distance_along
 
 TILTS = ("tilt_x", "tilt_y", "tilt_z")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.kernels.limits import FARTHEST, LONGEST
+from dolens.kernels.table import FARTHEST, LONGEST
 
 
 class Status(IntEnum):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
 from dolens.optics.rays import (
     Components,

@@ -11,7 +11,7 @@ from triton.runtime import interpreter
 from dolens import Rays
 from dolens.kernels import operators
 from dolens.kernels.cuda import backend as cuda
-from dolens.kernels.cuda import launching
+from dolens.kernels.cuda import device_table
 from dolens.optics import ray_tracing
 from tests.kernels.trace_cases import (
     LENSES,
@@ -33,9 +33,11 @@ SINGLE = ["cooke_triplet", "polynomial", "even_aspheres"]
 @pytest.fixture(autouse=True)
 def one_block(monkeypatch):
     """The interpreter takes its time for every block, however large."""
-    monkeypatch.setattr(launching, "FORWARD_BLOCK", 128)
-    monkeypatch.setattr(launching, "JACOBIAN_BLOCK", 128)
-    monkeypatch.setattr(launching, "ADJOINT_BLOCK", dict.fromkeys(launching.ADJOINT_BLOCK, 128))
+    monkeypatch.setattr(device_table, "FORWARD_BLOCK", 128)
+    monkeypatch.setattr(device_table, "JACOBIAN_BLOCK", 128)
+    monkeypatch.setattr(
+        device_table, "ADJOINT_BLOCK", dict.fromkeys(device_table.ADJOINT_BLOCK, 128)
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -162,9 +164,11 @@ def test_programs_that_take_several_blocks_in_turn_sum_the_same(root, monkeypatc
     lens = LENSES["clipped"](root)
     rays = bundle(lens, 70)
     alone = interpreted(lens, rays)
-    monkeypatch.setattr(launching, "FORWARD_BLOCK", 64)
-    monkeypatch.setattr(launching, "ADJOINT_BLOCK", dict.fromkeys(launching.ADJOINT_BLOCK, 32))
-    monkeypatch.setattr(launching, "ADJOINT_PROGRAMS", 2)
+    monkeypatch.setattr(device_table, "FORWARD_BLOCK", 64)
+    monkeypatch.setattr(
+        device_table, "ADJOINT_BLOCK", dict.fromkeys(device_table.ADJOINT_BLOCK, 32)
+    )
+    monkeypatch.setattr(device_table, "ADJOINT_PROGRAMS", 2)
     shared, again = interpreted(lens, rays), interpreted(lens, rays)
     require_equal(shared, alone, relative=1e-13)
     assert all(torch.equal(shared.gradients[k], again.gradients[k]) for k in shared.gradients)

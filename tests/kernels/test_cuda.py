@@ -133,8 +133,8 @@ def test_the_kernels_compile_and_keep_their_precision(name, real):
 
     The interpreter could not tell: it has no types but NumPy's.
     """
+    from dolens.kernels.cuda.device_table import ADJOINT_BLOCK, FORWARD_BLOCK, JACOBIAN_BLOCK
     from dolens.kernels.cuda.jacobian import jacobian_kernel
-    from dolens.kernels.cuda.launching import ADJOINT_BLOCK, FORWARD_BLOCK, JACOBIAN_BLOCK
     from dolens.kernels.cuda.trace import adjoint_kernel, forward_kernel
 
     forward = compile_for(forward_kernel, real, *LENSES[name], FORWARD_BLOCK, ("which",))

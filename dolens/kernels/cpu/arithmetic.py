@@ -17,7 +17,7 @@ from dolens.kernels.cpu.layout import (
     TOTALLY_REFLECTED,
     VIGNETTED,
 )
-from dolens.kernels.limits import GRAZING, LONGEST, TINY
+from dolens.kernels.table import GRAZING, LONGEST, TINY
 
 
 class Arithmetic(NamedTuple):

@@ -143,7 +143,7 @@ def stamped_sources() -> list[Path]:
     limits are among them.
     """
     here = Path(__file__).parent
-    above = ("limits.py", "table.py", "shapes.py")
+    above = ("table.py", "shapes.py")
     return [*sorted(here.rglob("*.py")), *(here.parent / name for name in above)]
 
 

@@ -44,7 +44,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 
 
 @cache

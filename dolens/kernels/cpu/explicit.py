@@ -66,8 +66,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.limits import GRAZING
-from dolens.kernels.table import LAST_STEPS, NEWTON_STEPS
+from dolens.kernels.table import GRAZING, LAST_STEPS, NEWTON_STEPS
 
 
 def explicit_forward(real: types.Type) -> Callable[..., None]:

@@ -49,7 +49,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.limits import FARTHEST, LONGEST
+from dolens.kernels.table import FARTHEST, LONGEST
 
 
 class Streams(NamedTuple):

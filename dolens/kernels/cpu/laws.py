@@ -71,9 +71,8 @@ from dolens.kernels.cpu.layout import (
     Z,
 )
 from dolens.kernels.cpu.shapes import Size, block_factory, sizes_of
-from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 from dolens.kernels.shapes import LawFunctions, PhaseFunctions
-from dolens.kernels.table import Code
+from dolens.kernels.table import LONGEST, LONGEST_WAVEVECTOR, STEEPEST, Code
 
 
 def phase_forward(real: types.Type) -> Callable[..., None]:

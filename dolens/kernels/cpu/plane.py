@@ -1,48 +1,32 @@
-"""Rays refract at planes and pass aperture stops."""
+"""Rays refract at planes."""
 
-import math
 from collections.abc import Callable
 
 from numba import carray, types
 
-from dolens.kernels.cpu.apertures import stopped_by_figures
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import StepFunctions, shifted
+from dolens.kernels.cpu.compiler import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
-    CENTER_X,
-    CENTER_Y,
-    CIRCLE,
     CODE_ROW,
     EDGE,
-    ELLIPSE,
-    FIGURES,
-    HALF_X,
-    HALF_Y,
-    HOLE,
-    HOLE_X,
-    HOLE_Y,
     INDEX,
     INVERSE_INDEX,
     LIMIT,
     OF_BEHIND,
     OF_FRONT,
     OF_SHIFT,
-    OUTLINE,
     PATH,
     RATIO,
-    RECTANGLE,
     REFRACTS,
     SENSE,
     SENSE_BEHIND,
     SHIFT,
     SHORT_RECORD,
     STATE,
-    STOPPED,
     TAG,
     TRAVELLED,
     UNBOUNDED,
-    VIGNETTED,
     WORK_SIZE,
     L,
     M,
@@ -51,7 +35,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 
 
 def plane_forward(real: types.Type) -> Callable[..., None]:
@@ -114,37 +98,6 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
             cot[OF_FRONT + i] = of_before + path * t
             cot[OF_BEHIND + i] = of_behind
             cot[OF_SHIFT + i] = z
-
-    return kernel
-
-
-def clip(real: types.Type) -> Callable[..., None]:
-    """Vignette where the clear aperture is no full circle; the circle is tested on the way."""
-    zero, one, vignetted = real(0.0), real(1.0), real(STOPPED)
-    stopped = stopped_by_figures(real)
-
-    def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        dst, p, q = carray(after, STATE), carray(record, SHORT_RECORD), carray(codes, CODE_ROW)
-        half_x, half_y, hole_x, hole_y, tag = p[HALF_X], p[HALF_Y], p[HOLE_X], p[HOLE_Y], p[TAG]
-        center_x, center_y, outline, hole = p[CENTER_X], p[CENTER_Y], q[OUTLINE], q[HOLE]
-        figures = q[FIGURES]
-        for i in range(BLOCK):
-            x, y = math.fabs(dst[X + i] - center_x), math.fabs(dst[Y + i] - center_y)
-            passes = True
-            if figures != 0:
-                passes = not stopped(shifted(record, figures), dst[X + i], dst[Y + i])
-            if outline == RECTANGLE:
-                passes = passes and x < half_x and y < half_y
-            elif outline == ELLIPSE:
-                passes = passes and half_x * x * x + half_y * y * y < one
-            if hole == CIRCLE:
-                passes = passes and x * x + y * y > hole_x
-            elif hole == RECTANGLE:
-                passes = passes and (x > hole_x or y > hole_y)
-            elif hole == ELLIPSE:
-                passes = passes and hole_x * x * x + hole_y * y * y > one
-            if not passes and not dst[VIGNETTED + i] > zero:
-                dst[VIGNETTED + i] = tag + vignetted
 
     return kernel
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.cpu import compiler, jobs, shapes
+from dolens.kernels.cpu.apertures import clip
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
     change_axes_forward,
@@ -44,7 +45,7 @@ from dolens.kernels.cpu.layout import (
     STENCIL_NUMBERS,
     WORK_ROWS,
 )
-from dolens.kernels.cpu.plane import clip, plane_adjoint
+from dolens.kernels.cpu.plane import plane_adjoint
 from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
 from dolens.kernels.shapes import shape_named
 from dolens.kernels.surface_kernel import kernels_of, law_kernels_of

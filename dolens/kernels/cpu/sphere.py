@@ -42,7 +42,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 
 
 def sphere_forward(real: types.Type) -> Callable[..., None]:

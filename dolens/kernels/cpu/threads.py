@@ -10,19 +10,78 @@ Drivers run without Python's lock.
 """
 
 import ctypes
+import logging
 import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numba import carray, types
 
-from dolens.kernels.cpu import compiler, team
-from dolens.openmp import torchs_openmp
+from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu.compiler import call_driver, fetch_add, int64_at
+from dolens.kernels.cpu.layout import UNBOUNDED
+
+logger = logging.getLogger(__name__)
+
+
+@cache
+def torchs_openmp() -> ctypes.CDLL | None:
+    """Return the OpenMP that torch runs on; None where it cannot be found, or has not gcc's
+    interface.
+
+    Torch loads its libraries for all to see, and the OpenMP that obeys its setting is its own.
+    """
+    try:
+        symbols = ctypes.CDLL(None)
+        symbols.omp_get_max_threads.restype = ctypes.c_int
+        symbols.GOMP_parallel.restype = None
+        symbols.GOMP_parallel.argtypes = (
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+            ctypes.c_uint,
+            ctypes.c_uint,
+        )
+        # Torch first: in a thread that is new to it, it sets OpenMP's number when it is asked.
+        if torch.get_num_threads() == symbols.omp_get_max_threads():
+            return symbols
+        reason = "another OpenMP is in the way"
+    except (AttributeError, OSError, TypeError) as error:
+        reason = str(error)
+    logger.info("kernels have threads of their own: torch's OpenMP not found (%s)", reason)
+    return None
+
+
+# Where a team finds things: places in an array of integers that its threads share.  Two counters,
+# and the number of shares;
+NEXT_WORKER, NEXT_SHARE, SHARES = range(3)
+# addresses: the driver, (first, end) of each share, and a job for each worker.
+DRIVER, BOUNDS, JOBS = range(3, 6)
+TASK = 6  # length
+
+
+@cache
+def team(real: types.Type) -> Callable[..., None]:
+    """Compile a thread's part of a task: cores are not equally fast, nor all ours, so none has its
+    own.
+    """
+
+    def kernel(task):  # noqa: ANN001, ANN202
+        bounds = carray(int64_at(task[BOUNDS]), UNBOUNDED)
+        worker = fetch_add(task, NEXT_WORKER, 1)
+        job = int64_at(carray(int64_at(task[JOBS]), UNBOUNDED)[worker])
+        share = fetch_add(task, NEXT_SHARE, 1)
+        while share < task[SHARES]:
+            call_driver(task[DRIVER], job, bounds[2 * share], bounds[2 * share + 1])
+            share = fetch_add(task, NEXT_SHARE, 1)
+
+    return kernel
+
 
 # Fewer rays than this are traced sooner than another thread is woken.
 SMALL = 1 << 14
@@ -91,9 +150,9 @@ def spread(driver: int, jobs: Sequence[int], pieces: int) -> None:
         return
     bounds = _shares(pieces, threads)
     addresses = np.array(jobs, dtype=np.int64)
-    task = np.zeros(team.TASK, dtype=np.int64)
-    task[team.SHARES], task[team.DRIVER] = len(bounds), driver
-    task[team.BOUNDS], task[team.JOBS] = bounds.ctypes.data, addresses.ctypes.data
+    task = np.zeros(TASK, dtype=np.int64)
+    task[SHARES], task[DRIVER] = len(bounds), driver
+    task[BOUNDS], task[JOBS] = bounds.ctypes.data, addresses.ctypes.data
     if (openmp := torchs_openmp()) is not None and not is_forked():
         run_with_openmp(openmp, task, threads)
     else:
@@ -108,12 +167,12 @@ def function_at(driver: int) -> Callable[[int, int, int], None]:
 
 def run_alone(task: np.ndarray) -> None:
     """Run a task in the calling thread."""
-    compiler.compile_team(team.team)(_integers(task))
+    compiler.compile_team(team)(_integers(task))
 
 
 def run_with_openmp(openmp: ctypes.CDLL, task: np.ndarray, threads: int) -> None:
     """Run a task on a team of OpenMP's."""
-    function = ctypes.cast(compiler.compile_team(team.team), ctypes.c_void_p)
+    function = ctypes.cast(compiler.compile_team(team), ctypes.c_void_p)
     openmp.GOMP_parallel(function, ctypes.c_void_p(task.ctypes.data), threads, 0)
 
 
@@ -128,7 +187,7 @@ def run_in_pool(task: np.ndarray, threads: int) -> None:
         run_alone(task)
     finally:
         # Whatever stops this thread (Ctrl-C), nobody may write to memory that is given back.
-        task[team.SHARES] = 0
+        task[SHARES] = 0
         _wait([other for other in others if not other.cancel()])
 
 

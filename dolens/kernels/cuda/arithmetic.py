@@ -15,11 +15,11 @@ pointers, one for every ray, and nothing is summed over them.
 import triton
 import triton.language as tl
 
-from dolens.kernels import limits
-from dolens.kernels.limits import LONGEST_WAVEVECTOR, STEEPEST
+from dolens.kernels import table
+from dolens.kernels.table import LONGEST_WAVEVECTOR, STEEPEST
 
-GRAZING, TINY = tl.constexpr(limits.GRAZING), tl.constexpr(limits.TINY)
-_LONGEST = tl.constexpr(limits.LONGEST)
+GRAZING, TINY = tl.constexpr(table.GRAZING), tl.constexpr(table.TINY)
+_LONGEST = tl.constexpr(table.LONGEST)
 
 
 @triton.jit

@@ -10,10 +10,9 @@ import torch
 import triton
 from torch import Tensor
 
-from dolens.kernels.cuda import launching
-from dolens.kernels.cuda.device_table import device_entries, prepared
+from dolens.kernels.cuda import device_table
+from dolens.kernels.cuda.device_table import device_entries, on, prepared, program_count, strides
 from dolens.kernels.cuda.jacobian import jacobian_kernel
-from dolens.kernels.cuda.launching import on, program_count, strides
 from dolens.kernels.cuda.layout import STATE
 from dolens.kernels.cuda.trace import adjoint_kernel, forward_kernel
 from dolens.kernels.least_squares_sums import least_squares_sums
@@ -51,7 +50,7 @@ def trace(table: SurfaceTable, rays: RayTensors) -> tuple[Tensor, Tensor, Tensor
     if lenses == 0 or count == 0:
         return out
     codes, media = prepared(table, position)
-    values, block = table.values, launching.FORWARD_BLOCK
+    values, block = table.values, device_table.FORWARD_BLOCK
     blocks = triton.cdiv(count, block)
     with on(position.device):
         forward_kernel[(lenses * blocks,)](
@@ -59,7 +58,7 @@ def trace(table: SurfaceTable, rays: RayTensors) -> tuple[Tensor, Tensor, Tensor
             codes.codes, codes.extras, len(codes.codes), count, blocks,
             position, *position.stride(), direction, *direction.stride(), which,
             *out, KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws,
-            BLOCK=block, **launching.OPTIONS,
+            BLOCK=block, **device_table.OPTIONS,
         )  # fmt: skip
     return out
 
@@ -95,7 +94,7 @@ def trace_adjoint(
     values, cut = table.values, table.values.shape[1]
     gradients = [position.new_zeros((lenses, count, 3)) if want else None for want in wanted[:2]]
     length = cut + table.indices[0].numel()
-    block = launching.ADJOINT_BLOCK[values.dtype]
+    block = device_table.ADJOINT_BLOCK[values.dtype]
     blocks = triton.cdiv(count, block)
     codes, media = prepared(table, position)
     steps = len(codes.codes)
@@ -118,7 +117,7 @@ def trace_adjoint(
                 of_path, *strides(of_path, 2), *gradients, sums, length,
                 values.new_empty(programs * kept),
                 KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws, INDICES=wanted[2],
-                BLOCK=block, **launching.OPTIONS,
+                BLOCK=block, **device_table.OPTIONS,
             )  # fmt: skip
     total = sums.reshape(lenses, parts, length).sum(1)
     return (
@@ -169,7 +168,7 @@ def ray_jacobians(
     if variables.indices is not None:
         assert index_derivatives is not None  # they go with the map
         of_index = index_derivatives.to(values).contiguous()
-    block, steps = launching.JACOBIAN_BLOCK, len(codes.codes)
+    block, steps = device_table.JACOBIAN_BLOCK, len(codes.codes)
     blocks = triton.cdiv(count, block)
     kept = (steps + 1) * STATE.value * block
     bytes_kept = (kept + block * entries.longest) * values.element_size()
@@ -186,7 +185,7 @@ def ray_jacobians(
             wanted, entries.outputs, variables.count, valid, found, jacobian,
             values.new_empty(programs * kept), values.new_empty(programs * block * entries.longest),
             entries.longest, KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws,
-            BLOCK=block, **launching.OPTIONS,
+            BLOCK=block, **device_table.OPTIONS,
         )  # fmt: skip
     return valid.bool(), found, jacobian
 

@@ -10,7 +10,7 @@ the number of rays.
 import triton
 import triton.language as tl
 
-from dolens.kernels import limits
+from dolens.kernels import table
 from dolens.kernels.cuda.arithmetic import add_by_column, add_sum, finite
 from dolens.kernels.cuda.layout import (
     AFTER,
@@ -32,7 +32,7 @@ from dolens.kernels.cuda.layout import (
 from dolens.kernels.cuda.step import step
 from dolens.kernels.cuda.step_adjoint import step_adjoint
 
-_FARTHEST, _LONGEST = tl.constexpr(limits.FARTHEST), tl.constexpr(limits.LONGEST)
+_FARTHEST, _LONGEST = tl.constexpr(table.FARTHEST), tl.constexpr(table.LONGEST)
 
 
 @triton.jit

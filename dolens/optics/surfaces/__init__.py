@@ -1,8 +1,8 @@
 """A surface shape has a file here, and registers itself under the `type` of a prescription."""
 
-from dolens.kernels.limits import GRAZING
 from dolens.kernels.shapes import Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.kernels.table import GRAZING
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.base import PackedShape, Surface
 from dolens.optics.surfaces.biconic import Biconic

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.kernels.limits import GRAZING
 from dolens.kernels.shapes import TABLE, Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.kernels.table import Code
+from dolens.kernels.table import GRAZING, Code
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root

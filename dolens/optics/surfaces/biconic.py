@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.limits import TINY
 from dolens.kernels.operations import Number, divide, fma, put, safe_sqrt, where
 from dolens.kernels.shapes import Shape
+from dolens.kernels.table import TINY
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import Outline, Rectangle
 from dolens.optics.surfaces.registry import register_surface

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.limits import GRAZING, TINY
 from dolens.kernels.operations import Number, divide, safe_sqrt
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.kernels.table import Kind
+from dolens.kernels.table import GRAZING, TINY, Kind
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.refraction import PlaneRay

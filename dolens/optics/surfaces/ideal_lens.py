@@ -20,10 +20,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.kernels.limits import GRAZING
 from dolens.kernels.operations import Number, divide, put, sqrt, where
 from dolens.kernels.shapes import LawFunctions
 from dolens.kernels.surface_kernel import LawKernel
+from dolens.kernels.table import GRAZING
 from dolens.optics.surfaces.base import PackedShape, Parameters
 from dolens.optics.surfaces.deflection import (
     Deflected,

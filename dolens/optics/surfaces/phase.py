@@ -24,7 +24,6 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 from dolens.kernels.operations import (
     Number,
     divide,
@@ -39,7 +38,7 @@ from dolens.kernels.operations import (
 )
 from dolens.kernels.shapes import TABLE, PhaseFunctions
 from dolens.kernels.surface_kernel import LawKernel
-from dolens.kernels.table import Code
+from dolens.kernels.table import LONGEST, LONGEST_WAVEVECTOR, STEEPEST, Code
 from dolens.optics.surfaces.base import Parameters, everywhere, tensor_of
 from dolens.optics.surfaces.deflection import (
     Deflected,

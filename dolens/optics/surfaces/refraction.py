@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.kernels.limits import LONGEST
 from dolens.kernels.operations import safe_sqrt
+from dolens.kernels.table import LONGEST
 
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3

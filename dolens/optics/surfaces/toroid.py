@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.limits import GRAZING, TINY
 from dolens.kernels.operations import (
     Number,
     divide,
@@ -19,6 +18,7 @@ from dolens.kernels.operations import (
     zero,
 )
 from dolens.kernels.shapes import Shape
+from dolens.kernels.table import GRAZING, TINY
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.even_asphere import (
     EVEN_ASPHERE,

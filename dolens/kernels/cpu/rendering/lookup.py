@@ -30,7 +30,7 @@ from dolens.kernels.cpu.rendering.layout import (
     TEXTURE_COLUMN,
     TEXTURE_ROW,
 )
-from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import GRAZING
 
 
 class Lookup(NamedTuple):

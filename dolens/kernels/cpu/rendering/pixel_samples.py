@@ -62,7 +62,7 @@ from dolens.kernels.cpu.rendering.layout import (
     WEIGHT,
     WIDTH,
 )
-from dolens.kernels.limits import TINY
+from dolens.kernels.table import TINY
 
 
 class Sampler(NamedTuple):
