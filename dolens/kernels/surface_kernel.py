@@ -31,7 +31,7 @@ class SurfaceKernel:
         cuda: the name of one with Triton functions, or None.
 
     Rarely needed:
-        kind: a surface in closed form that the kernels' own sources name.
+        kind: a surface in closed form, whose kernels are named by `table.Kind`.
 
         shape: the surface's functions, in the place of modules.
 
@@ -52,7 +52,8 @@ class SurfaceKernel:
     def serves(self, device: str) -> bool:
         """Return whether there are kernels for `cpu` or `cuda`."""
         named = {"cpu": self.cpu, "cuda": self.cuda}.get(device) is not None
-        return named or (self.shape is not None and device in ("cpu", "cuda"))
+        for_both = self.shape is not None or self.kind is not None
+        return named or (for_both and device in ("cpu", "cuda"))
 
 
 @cache

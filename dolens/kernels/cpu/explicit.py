@@ -13,9 +13,9 @@ from typing import Any
 
 from numba import carray, types
 
+from dolens.kernels.conic import conic_distance
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import Factory, StepFunctions, call_block
-from dolens.kernels.cpu.conic import conic_distance
 from dolens.kernels.cpu.layout import (
     BLOCK,
     CODE_ROW,
@@ -66,6 +66,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
+from dolens.kernels.cpu.translation import scalar
 from dolens.kernels.table import GRAZING, LAST_STEPS, NEWTON_STEPS
 
 
@@ -76,7 +77,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
     converged is read off its residual at the end.
     """
     clamp, _, arrive, set_status, refract, _ = arithmetic(real)
-    distance = conic_distance(real)
+    distance = scalar(conic_distance, real)
     zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
     epsilon = real(2.0**-23 if real is types.float32 else 2.0**-52)
     close, rounding = real(math.sqrt(float(epsilon))), real(64.0) * epsilon

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     CODE_ROW,
@@ -100,6 +99,3 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
             cot[OF_SHIFT + i] = z
 
     return kernel
-
-
-KERNELS = StepFunctions(plane_forward, plane_adjoint)

@@ -22,6 +22,12 @@ from dolens.kernels.cpu.axes import (
     sensor_forward,
 )
 from dolens.kernels.cpu.compiler import LawBlocks, Row, StepFunctions
+from dolens.kernels.cpu.conic import (
+    conic_adjoint,
+    conic_forward,
+    sphere_adjoint,
+    sphere_forward,
+)
 from dolens.kernels.cpu.laws import phase_adjoint, phase_forward
 from dolens.kernels.cpu.layout import (
     ADJOINT,
@@ -45,7 +51,7 @@ from dolens.kernels.cpu.layout import (
     STENCIL_NUMBERS,
     WORK_ROWS,
 )
-from dolens.kernels.cpu.plane import plane_adjoint
+from dolens.kernels.cpu.plane import plane_adjoint, plane_forward
 from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
 from dolens.kernels.shapes import shape_named
 from dolens.kernels.surface_kernel import kernels_of, law_kernels_of
@@ -53,8 +59,11 @@ from dolens.kernels.table import OUTPUT_ROWS, Code, Kind, Outline, Slot, Surface
 
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 
-# Steps that are no surfaces; the sensor's adjoint is a plane's between equal media.
+# Steps that `Kind` names; the sensor's adjoint is a plane's between equal media.
 _STEPS = {
+    Kind.PLANE: StepFunctions(plane_forward, plane_adjoint),
+    Kind.SPHERE: StepFunctions(sphere_forward, sphere_adjoint),
+    Kind.CONIC: StepFunctions(conic_forward, conic_adjoint),
     Kind.CHANGE_AXES: StepFunctions(change_axes_forward, change_axes_adjoint),
     Kind.LENS_AXES: StepFunctions(lens_axes_forward, lens_axes_adjoint),
     Kind.SENSOR: StepFunctions(sensor_forward, plane_adjoint),

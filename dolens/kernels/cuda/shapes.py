@@ -1,6 +1,6 @@
 """A shape's functions are compiled for a block of rays; a series is a pointer and its length."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from types import FunctionType
 from typing import Any
@@ -9,90 +9,14 @@ import triton
 import triton.language as tl
 from triton.runtime.interpreter import InterpretedFunction
 
-from dolens.kernels import operations, shapes
-from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
+from dolens.kernels import shapes
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import EXTRAS, SHAPE
-from dolens.kernels.shapes import Shape, shape_named, translated
+from dolens.kernels.cuda.translation import compiled
+from dolens.kernels.shapes import Shape, shape_named
 
 # In the place of a layout's None, which Triton does not compare; and a table.
 SINGLE, TABLE = tl.constexpr(-2), tl.constexpr(shapes.TABLE)
-
-
-@triton.jit
-def fma(a, b, c):
-    """Return a·b + c."""
-    return a * b + c
-
-
-@triton.jit
-def sqrt(a):
-    """Return the square root, rounded to nearest."""
-    if a.dtype == tl.float64:
-        return tl.sqrt(a)
-    else:
-        return tl.sqrt_rn(a)
-
-
-@triton.jit
-def where(condition, a, b):
-    """Return a where the condition holds, and else b."""
-    return tl.where(condition, a, b)
-
-
-@triton.jit
-def zero(like):
-    """Return zero for each ray."""
-    return tl.zeros_like(like)
-
-
-@triton.jit
-def number(integer, like):
-    """Return an integer as a number of another's precision; with a literal it would be single."""
-    return integer + tl.zeros_like(like)
-
-
-@triton.jit
-def length(series):
-    """Return how many numbers a series has."""
-    return series[1]
-
-
-@triton.jit
-def term(series, i):
-    """Return a number of a series."""
-    return tl.load(series[0] + i)
-
-
-@triton.jit
-def entry(table, i):
-    """Return an integer of a table."""
-    return tl.load(table[0] + i)
-
-
-@triton.jit
-def put(cotangents, place, value):
-    """Add a number's cotangents to its sum; see `add_sum`."""
-    add_sum(cotangents[0] + place, value, cotangents[1])
-
-
-_OPERATIONS = {
-    getattr(operations, name): made
-    for name, made in {
-        "fma": fma, "divide": divide, "sqrt": sqrt, "safe_sqrt": safe_sqrt, "where": where,
-        "zero": zero, "number": number, "length": length, "term": term, "entry": entry, "put": put,
-    }.items()
-}  # fmt: skip
-
-
-def _constant(value: Any) -> Any:
-    """Return a number as Triton takes it; any other thing is the type of an argument."""
-    return tl.constexpr(value) if isinstance(value, int | float) else tl.tensor
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Return a shape's function, compiled by Triton where it is called."""
-    return translated(function, _OPERATIONS, triton.jit, lambda literal: literal, _constant)
 
 
 @triton.jit

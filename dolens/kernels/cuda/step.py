@@ -21,11 +21,10 @@ from dolens.kernels.cuda.arithmetic import (
 )
 from dolens.kernels.cuda.axes import change_axes, lens_axes
 from dolens.kernels.cuda.conic import (
-    conic_curvature_cotangent,
     conic_distance,
-    conic_gradient,
     conic_intersect,
-    conic_sums,
+    gradient_and_second,
+    shape_cotangents,
     sphere_intersect,
 )
 from dolens.kernels.cuda.functions import CODE, HESSIAN, LAW_CODE, LAW_FORWARD, ON_CONIC, SAG, SUMS
@@ -295,12 +294,13 @@ def surface_gradient(
     xx, xy, yy, zz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     if HAS_SPHERE & KINDS:
         if kind == SPHERE:
-            gx, gy, gz, _, xx, zz = conic_gradient(tl.load(record + SHAPE), 0.0, x, y, z)
+            c = tl.load(record + SHAPE)
+            gx, gy, gz, _, xx, zz = gradient_and_second(c, 0.0, x, y, z)
             yy = xx
     if HAS_CONIC & KINDS:
         if kind == CONIC:
             c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
-            gx, gy, gz, inverse, xx, zz = conic_gradient(c, k, x, y, z)
+            gx, gy, gz, inverse, xx, zz = gradient_and_second(c, k, x, y, z)
             yy = xx
     for k in tl.static_range(len(FORMS)):
         if kind == FORMS[k][CODE]:
@@ -318,11 +318,15 @@ def shape_sums(
     """Add the cotangents of a shape's numbers, from τ and (ux, uy, uz), the cotangent of g."""
     if HAS_SPHERE & KINDS:
         if kind == SPHERE:
-            of_c = conic_curvature_cotangent(0.0, x, y, z, along, ux, uy, uz)
+            c = tl.load(record + SHAPE)
+            of_c, _ = shape_cotangents(c, 0.0, x, y, z, along, ux, uy, uz)
             add_sum(sums + SHAPE, of_c, alive)
     if HAS_CONIC & KINDS:
         if kind == CONIC:
-            conic_sums(record, sums, x, y, z, along, ux, uy, uz, alive)
+            c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
+            of_c, of_k = shape_cotangents(c, k, x, y, z, along, ux, uy, uz)
+            add_sum(sums + SHAPE, of_c, alive)
+            add_sum(sums + SHAPE + 1, of_k, alive)
     for k in tl.static_range(len(FORMS)):
         if kind == FORMS[k][CODE]:
             FORMS[k][SUMS](record, codes, extras, sums, x, y, along, -ux, -uy, alive)

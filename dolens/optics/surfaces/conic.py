@@ -7,15 +7,14 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.conic import conic_distance, conic_gradient, quadratic_root
 from dolens.kernels.operations import Number, divide, safe_sqrt
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.kernels.table import GRAZING, TINY, Kind
+from dolens.kernels.table import TINY, Kind
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
-
-_FLAT = 1e-15  # 1/mm
 
 
 def conic_sag(c: Number, k: Number, r2: Number) -> tuple[Number, Number, Number]:
@@ -61,40 +60,20 @@ def conic_cotangents(
     )
 
 
-def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[Tensor, Tensor]:
-    """Return the distance from the vertex plane to a conic, on the crossing in the direction of
-    `sense`.
-
-    Along the ray, A·t² - 2G·t + F = 0 with F = c(x² + y²), G = n - c(lx + my) and
-    A = c(1 + k·n²).  At a root, direction · gradient = G - A·t = ±√D with D = G² - AF, so the
-    sign of the root is the sense of crossing.  t = F/(G + s√D) has no cancellation where
-    s·G > 0, and holds for planes; where s·G < 0 the other form, (G - s√D)/A, is the one without.
-
-    Args:
-        c: curvature, 1/mm.
-        a: A, of any shape that broadcasts.
-        ray: at the vertex plane.
-        sense: s.
-
-    Returns:
-        t (mm), and D as the margin that is positive where the conic is met.
+def distance_to_conic(
+    c: Tensor, k: Tensor | float, ray: PlaneRay, sense: float
+) -> tuple[Tensor, Tensor]:
+    """Return the distance (mm) from the vertex plane to a conic, and a margin; see
+    `dolens.kernels.conic`.
     """
-    x, y, l, m, n = ray  # noqa: E741
-    f = c * torch.addcmul(x * x, y, y)
-    g = n - c * torch.addcmul(l * x, m, y)
-    return _root(f, g, a, sense)
+    t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), *ray, sense)
+    return t, met.detach()
 
 
-def _root(f: Tensor, g: Tensor, a: Tensor, sense: float) -> tuple[Tensor, Tensor]:
-    """Return the root t of A·t² - 2G·t + F = 0 and the margin D; see `conic_distance`."""
-    discriminant = g * g - a * f
-    root = safe_sqrt(discriminant)
-    along = g if sense > 0.0 else -g
-    near = f / (along + root).clamp(min=GRAZING)
-    # Where A is this small the far root is out of any lens's reach, and 1/A² out of float32's.
-    far = (along - root) / torch.where(a.abs() < _FLAT, torch.ones_like(a), a)
-    t = torch.where(along > 0.0, near, far)
-    return (t if sense > 0.0 else -t), discriminant.detach()
+def start_on_conic(p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
+    """Return the distance (mm) to a surface's conic, or zero where that is out of reach."""
+    t, met = distance_to_conic(p["curvature"], p["conic"], ray, sense)
+    return torch.where(met > 0.0, t, torch.zeros_like(t))
 
 
 def check_reach(surface: Surface) -> None:
@@ -119,7 +98,7 @@ class Conic(Surface):
     """
 
     kind = "conic"
-    kernel = SurfaceKernel("dolens.kernels.cpu.conic", "dolens.kernels.cuda.conic", Kind.CONIC)
+    kernel = SurfaceKernel(kind=Kind.CONIC)
     rotational = True
     closed_form = True
 
@@ -159,7 +138,7 @@ class Conic(Surface):
     ) -> tuple[Tensor, Tensor | None]:
         """Find the ray intercept in closed form, on the sag branch where 1 - (1+k)·c·z > 0."""
         c, k = p["curvature"], p["conic"]
-        t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
+        t, met = distance_to_conic(c, k, ray, sense)
         branch = 1.0 - ((1.0 + k) * c).detach() * (ray.n * t).detach()
         return t, torch.minimum(met, branch)
 
@@ -178,9 +157,9 @@ class Conic(Surface):
         x, y, z, l, m, n = ray  # noqa: E741
         f = c * (x * x + y * y + (1.0 + k) * (z * z)) - 2.0 * z
         g = n - c * (l * x + m * y + (1.0 + k) * (n * z))
-        t, met = _root(f, g, c * (1.0 + k * (n * n)), sense)
+        t, met = quadratic_root(f, g, c * (1.0 + k * (n * n)), sense)
         branch = 1.0 - ((1.0 + k) * c * (z + n * t)).detach()
-        return t, torch.minimum(met, branch)
+        return t, torch.minimum(met.detach(), branch)
 
     @classmethod
     def normal(
@@ -188,7 +167,7 @@ class Conic(Surface):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return (-cx, -cy, 1 - (1+k)cz) over its length."""
         c, k = p["curvature"], p["conic"]
-        nx, ny, nz = -c * x, -c * y, 1.0 - ((1.0 + k) * c) * z
+        nx, ny, nz = conic_gradient(c, k, x, y, z)
         squared = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
         inverse = torch.rsqrt(squared.clamp(min=TINY))
         return nx * inverse, ny * inverse, nz * inverse
@@ -217,7 +196,7 @@ class Sphere(Conic):
     """
 
     kind = "sphere"
-    kernel = SurfaceKernel("dolens.kernels.cpu.sphere", "dolens.kernels.cuda.conic", Kind.SPHERE)
+    kernel = SurfaceKernel(kind=Kind.SPHERE)
     rotational = True
     closed_form = True
 
@@ -237,16 +216,15 @@ class Sphere(Conic):
     ) -> tuple[Tensor, Tensor | None]:
         """Find the ray intercept in closed form, on the near half where 1 - c·z > 0."""
         c = p["curvature"]
-        t, met = conic_distance(c, c, ray, sense)
-        return t, torch.minimum(met, 1.0 - c.detach() * (ray.n * t).detach())
+        t, met = conic_distance(c, c, *ray, sense)
+        return t, torch.minimum(met.detach(), 1.0 - c.detach() * (ray.n * t).detach())
 
     @classmethod
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return (-cx, -cy, 1 - cz), a unit vector on the sphere."""
-        c = p["curvature"]
-        return -c * x, -c * y, 1.0 - c * z
+        return conic_gradient(p["curvature"], 0.0, x, y, z)
 
     @classmethod
     @by_names

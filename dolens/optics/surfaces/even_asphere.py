@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -26,8 +25,8 @@ from dolens.optics.surfaces.conic import (
     Conic,
     check_reach,
     conic_cotangents,
-    conic_distance,
     conic_slopes,
+    start_on_conic,
 )
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
@@ -159,9 +158,7 @@ class EvenAsphere(Conic):
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """Return the conic's own intersection, or the vertex plane where that is out of reach."""
-        c, k = p["curvature"], p["conic"]
-        t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
-        return torch.where(met > 0.0, t, torch.zeros_like(t))
+        return start_on_conic(p, ray, sense)
 
     @classmethod
     def intersect(
@@ -202,7 +199,7 @@ class AsphereWithTerms(Surface):
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """Return the conic's own intersection, or the vertex plane where that is out of reach."""
-        return EvenAsphere.start(p, ray, sense)
+        return start_on_conic(p, ray, sense)
 
 
 def even_asphere(p: Parameters) -> dict[str, Tensor]:

@@ -36,9 +36,9 @@ from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.conic import (
     check_reach,
     conic_cotangents,
-    conic_distance,
     conic_sag,
     conic_slopes,
+    start_on_conic,
 )
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import order_of, order_pattern, register_surface
@@ -272,9 +272,7 @@ class ForbesSag(Surface):
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """Return the conic's own intersection, or the vertex plane where that is out of reach."""
-        c, k = p["curvature"], p["conic"]
-        t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
-        return torch.where(met > 0.0, t, torch.zeros_like(t))
+        return start_on_conic(p, ray, sense)
 
 
 @register_surface

@@ -18,7 +18,7 @@ class Plane(Surface):
     """The surface is flat, refracts, and has no parameters."""
 
     kind = "plane"
-    kernel = SurfaceKernel("dolens.kernels.cpu.plane", "dolens.kernels.cuda.step", Kind.PLANE)
+    kernel = SurfaceKernel(kind=Kind.PLANE)
     rotational = True
     closed_form = True
 
