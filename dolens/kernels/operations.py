@@ -46,6 +46,11 @@ def safe_sqrt(squared: Number) -> Number:
     return torch.sqrt(squared.clamp(min=TINY))
 
 
+def clamp(a: Number, limit: float) -> Number:
+    """Return a number, held within ± a positive limit; NaN stays."""
+    return a.clamp(-limit, limit)
+
+
 def where(condition: Any, a: Number, b: Number) -> Number:
     """Return a where the condition holds, and else b."""
     if isinstance(condition, bool):

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from numba import carray, types
 
-from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import LawBlocks, Row, call_block, shifted
 from dolens.kernels.cpu.layout import (
     BLOCK,
@@ -71,17 +70,16 @@ from dolens.kernels.cpu.layout import (
     Z,
 )
 from dolens.kernels.cpu.shapes import Size, block_factory, sizes_of
+from dolens.kernels.cpu.translation import scalar
+from dolens.kernels.refraction import deflect, deflect_adjoint
 from dolens.kernels.shapes import LawFunctions, PhaseFunctions
-from dolens.kernels.table import LONGEST, LONGEST_WAVEVECTOR, STEEPEST, Code
+from dolens.kernels.table import Code
 
 
 def phase_forward(real: types.Type) -> Callable[..., None]:
     """Deflect a block of rays that stand on a surface; an evanescent order ends them."""
-    clamp, safe_sqrt, *_ = arithmetic(real)
-    zero, one = real(0.0), real(1.0)
-    longest, steepest = real(LONGEST), real(STEEPEST)
-    longest_wavevector = real(LONGEST_WAVEVECTOR)
-    totally_reflected = real(TOTALLY_REFLECTED)
+    behind_phase = scalar(deflect, real)
+    zero, one, totally_reflected = real(0.0), real(1.0), real(TOTALLY_REFLECTED)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)
@@ -95,36 +93,25 @@ def phase_forward(real: types.Type) -> Callable[..., None]:
         for i in range(BLOCK):
             ratio, per_radian = w[RATIO + i], w[PER_RADIAN + i]
             scale = per_radian * ratio * w[INVERSE_INDEX + i]
-            gx, gy = scale * w[PHASE_X + i], scale * w[PHASE_Y + i]
-            bx, by, az = ratio * src[L + i], ratio * src[M + i], ratio * src[N + i]
-            ax, ay = bx + gx, by + gy
             sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
-            nx, ny = -sx * nz, -sy * nz
-            along = clamp(ax * nx + ay * ny + az * nz, longest_wavevector)
-            more = gx * (ax + bx) + gy * (ay + by)
-            squared = (one - ratio * ratio) - more + along * along
-            squared = squared if math.fabs(gx) + math.fabs(gy) < steepest else -one
-            change = sense * safe_sqrt(squared) - along
+            l, m, n, transmitted = behind_phase(  # noqa: E741
+                scale * w[PHASE_X + i], scale * w[PHASE_Y + i], src[L + i], src[M + i], src[N + i],
+                -sx * nz, -sy * nz, nz, ratio, sense,
+            )  # fmt: skip
             dst[X + i], dst[Y + i], dst[Z + i] = src[X + i], src[Y + i], src[Z + i]
-            dst[L + i] = clamp(ax + change * nx, longest)
-            dst[M + i] = clamp(ay + change * ny, longest)
-            dst[N + i] = clamp(az + change * nz, longest)
+            dst[L + i], dst[M + i], dst[N + i] = l, m, n
             dst[PATH + i] = src[PATH + i] + per_radian * w[PHASE + i]
             ended = src[ENDED + i]
-            dst[ENDED + i] = ended if ended > zero or squared > zero else evanescent
+            dst[ENDED + i] = ended if ended > zero or transmitted > zero else evanescent
             dst[VIGNETTED + i], dst[TRAVELLED + i] = src[VIGNETTED + i], zero
 
     return kernel
 
 
 def phase_adjoint(real: types.Type) -> Callable[..., None]:
-    """Sweep cotangents back through a phase, in place.
-
-    d' = a + Γ·N with a = μ·d + g, Γ = D - a·N and D = d'·N, where D² = 1 - μ² - g·(2μ·d + g) +
-    (a·N)².  So with (ā, b̄, c̄) = d̄', Γ̄ = d̄'·N, e = Γ̄/D and t = d̄' + (e·(a·N) - Γ̄)·N the
-    cotangents are d̄ = μ(t - e·g), ḡ = t - e·a, μ̄ = d·t - e(μ + g·d), N̄ = Γ·d̄' + (e·(a·N) - Γ̄)·a.
-    """
+    """Sweep cotangents back through a phase, in place."""
+    before_phase = scalar(deflect_adjoint, real)
     zero, one = real(0.0), real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -137,27 +124,16 @@ def phase_adjoint(real: types.Type) -> Callable[..., None]:
         call_block(q[SAG_HESSIAN], before, after, cotangents, record, work, codes)
         call_block(q[PHASE_HESSIAN], before, after, cotangents, record, work, codes)
         for i in range(BLOCK):
-            ratio, per_radian = w[RATIO + i], w[PER_RADIAN + i]
-            per_index = ratio * w[INVERSE_INDEX + i]
-            scale = per_radian * per_index
-            gx, gy = scale * w[PHASE_X + i], scale * w[PHASE_Y + i]
-            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
-            ax, ay, az = ratio * l + gx, ratio * m + gy, ratio * n
+            ratio, per_radian, per_index = w[RATIO + i], w[PER_RADIAN + i], w[INVERSE_INDEX + i]
+            scale = per_radian * ratio * per_index
             sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
-            a, b, c = cot[L + i], cot[M + i], cot[N + i]
-            inside = dst[L + i] * nx + dst[M + i] * ny + dst[N + i] * nz
-            along = ax * nx + ay * ny + az * nz
-            change = inside - along
-            of_change = a * nx + b * ny + c * nz
-            e = of_change / inside
-            of_along = e * along - of_change
-            tx, ty, tz = a + of_along * nx, b + of_along * ny, c + of_along * nz
-            of_gx, of_gy = tx - e * ax, ty - e * ay
-            of_ratio = (l * tx + m * ty + n * tz) - e * (ratio + gx * l + gy * m)
-            vx, vy = change * a + of_along * ax, change * b + of_along * ay
-            vz = change * c + of_along * az
+            of_gx, of_gy, l, m, n, vx, vy, vz, front, behind = before_phase(  # noqa: E741
+                scale * w[PHASE_X + i], scale * w[PHASE_Y + i], src[L + i], src[M + i], src[N + i],
+                nx, ny, nz, dst[L + i], dst[M + i], dst[N + i],
+                cot[L + i], cot[M + i], cot[N + i], ratio, per_index,
+            )  # fmt: skip
             across = vx * nx + vy * ny + vz * nz
             of_sx, of_sy = -(vx - across * nx) * nz, -(vy - across * ny) * nz
             path = per_radian * cot[PATH + i]
@@ -170,11 +146,8 @@ def phase_adjoint(real: types.Type) -> Callable[..., None]:
                 of_sx * w[SAG_XY + i] + of_sy * w[SAG_YY + i]
                 + path * w[PHASE_Y + i] + of_px * w[PHASE_XY + i] + of_py * w[PHASE_YY + i]
             )  # fmt: skip
-            cot[L + i], cot[M + i] = ratio * (tx - e * gx), ratio * (ty - e * gy)
-            cot[N + i] = ratio * tz
-            cot[OF_FRONT + i] = of_ratio * per_index
-            cot[OF_BEHIND + i] = -(of_ratio * ratio + gx * of_gx + gy * of_gy) * per_index
-            cot[OF_SHIFT + i] = zero
+            cot[L + i], cot[M + i], cot[N + i] = l, m, n
+            cot[OF_FRONT + i], cot[OF_BEHIND + i], cot[OF_SHIFT + i] = front, behind, zero
             w[OF_SAG + i], w[OF_SLOPE_X + i], w[OF_SLOPE_Y + i] = zero, of_sx, of_sy
             w[OF_PHASE + i], w[OF_PHASE_X + i], w[OF_PHASE_Y + i] = path, of_px, of_py
         call_block(q[PARAMETERS], before, after, cotangents, record, work, codes)

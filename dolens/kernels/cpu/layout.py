@@ -27,26 +27,22 @@ STATE = 10 * BLOCK
 # Work rows that a driver fills before each step: the index in front, the ratio μ of the index in
 # front to the one behind, and one over the index in front.
 INDEX, RATIO = _rows(0, 2)
-(INVERSE_INDEX,) = _rows(24, 1)
+(INVERSE_INDEX,) = _rows(16, 1)
 # Where a shape evaluates its sag, and what it gives there: sag (mm), slopes, a margin that is
 # positive on the branch of the sag, and the sag's Hessian (1/mm).
 POINT_X, POINT_Y, SAG, SLOPE_X, SLOPE_Y, MARGIN, SAG_XX, SAG_XY, SAG_YY = _rows(2, 9)
 # Cotangents of sag and slopes; the axial distance from the vertex plane (mm).
 OF_SAG, OF_SLOPE_X, OF_SLOPE_Y, DISTANCE = _rows(11, 4)
-# Eight rows of a shape's own.
-OWN = _rows(16, 8)
 # Its first number is zero when a ray comes to the surface, and one when a spline's stencil is here.
-(STENCIL_IS_HERE,) = _rows(25, 1)
-(CUBIC,) = _rows(26, 1)  # the coefficients of a cubic polynomial
+(STENCIL_IS_HERE,) = _rows(17, 1)
 # Of a deflection: λ/2π (mm); the phase (radians), its gradient and second derivatives at the
-# points; cotangents of phase and gradient; six rows of a phase's own.
-(PER_RADIAN,) = _rows(48, 1)
-PHASE, PHASE_X, PHASE_Y, PHASE_XX, PHASE_XY, PHASE_YY = _rows(49, 6)
-OF_PHASE, OF_PHASE_X, OF_PHASE_Y = _rows(55, 3)
-OWN_OF_PHASE = _rows(58, 6)
-WORK_ROWS = 64  # those above
+# points; cotangents of phase and gradient.
+(PER_RADIAN,) = _rows(18, 1)
+PHASE, PHASE_X, PHASE_Y, PHASE_XX, PHASE_XY, PHASE_YY = _rows(19, 6)
+OF_PHASE, OF_PHASE_X, OF_PHASE_Y = _rows(25, 3)
+WORK_ROWS = 28  # those above
 WORK_SIZE = WORK_ROWS * BLOCK
-# As many more as a shape asks for: a polynomial's powers, a spline's stencil.
+# As many more as a shape asks for: a grid's cells, a spline's stencil.
 (FURTHER,) = _rows(WORK_ROWS, 1)
 
 # Cotangents: X to PATH as in a state, then those of the indices in front and behind.

@@ -103,7 +103,14 @@ def operations_of(real: types.Type) -> dict[Any, Any]:
         """Return the square root; an argument that is not positive counts as 1e-18."""
         return math.sqrt(squared if squared > tiny else tiny)
 
-    own = (*own, safe_sqrt)
+    @njit(**OPTIONS)
+    def clamp(value, limit):  # noqa: ANN001, ANN202
+        """Return the value, held within ± limit; NaN stays."""
+        low = -limit
+        value = low if value < low else value
+        return limit if value > limit else value
+
+    own = (*own, safe_sqrt, clamp)
     return {getattr(operations, one.__name__): one for one in own}
 
 

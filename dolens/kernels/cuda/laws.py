@@ -4,11 +4,15 @@ from functools import cache
 
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import deflect, deflect_adjoint, divide
+from dolens.kernels import refraction
+from dolens.kernels.cuda.arithmetic import divide
 from dolens.kernels.cuda.functions import LawKernels
 from dolens.kernels.cuda.layout import LAW_EXTRAS
 from dolens.kernels.cuda.shapes import bound, unpacked
+from dolens.kernels.cuda.translation import compiled
 from dolens.kernels.shapes import LawFunctions, PhaseFunctions
+
+deflect, deflect_adjoint = compiled(refraction.deflect), compiled(refraction.deflect_adjoint)
 
 
 # The names in capitals are bound for each law.
@@ -17,7 +21,9 @@ def _phase(
 ):  # fmt: skip
     p = unpacked(numbers, codes, extras + tl.load(codes + LAW_EXTRAS), LAYOUT)  # noqa: F821
     phase, px, py = PHASE(p, x, y)  # noqa: F821
-    return deflect(phase, px, py, l, m, n, nx, ny, nz, index, ratio, per_radian, sense)
+    scale = divide(per_radian * ratio, index)
+    l, m, n, transmitted = deflect(scale * px, scale * py, l, m, n, nx, ny, nz, ratio, sense)
+    return l, m, n, transmitted, per_radian * phase
 
 
 def _phase_adjoint(
@@ -26,10 +32,14 @@ def _phase_adjoint(
 ):  # fmt: skip
     p = unpacked(numbers, codes, extras + tl.load(codes + LAW_EXTRAS), LAYOUT)  # noqa: F821
     _, px, py, xx, xy, yy = HESSIAN(p, x, y)  # noqa: F821
-    of_phase, of_px, of_py, qx, qy, a, b, c, vx, vy, vz, of_front, of_behind = deflect_adjoint(
-        px, py, xx, xy, yy, l, m, n, nx, ny, nz, index, ratio, per_radian,
-        out_l, out_m, out_n, a, b, c, path,
-    )  # fmt: skip
+    per_index = divide(1.0, index)
+    scale = per_radian * ratio * per_index
+    of_gx, of_gy, a, b, c, vx, vy, vz, of_front, of_behind = deflect_adjoint(
+        scale * px, scale * py, l, m, n, nx, ny, nz, out_l, out_m, out_n, a, b, c, ratio, per_index
+    )
+    of_phase, of_px, of_py = per_radian * path, scale * of_gx, scale * of_gy
+    qx = of_phase * px + of_px * xx + of_py * xy
+    qy = of_phase * py + of_px * xy + of_py * yy
     PARAMETERS((sums, alive), p, x, y, of_phase, of_px, of_py)  # noqa: F821
     return qx, qy, a, b, c, vx, vy, vz, of_front, of_behind
 

@@ -10,13 +10,13 @@ F = z - sag, or a conic's implicit form; the unit normal is g/|g|.
 import triton
 import triton.language as tl
 
+from dolens.kernels import refraction
 from dolens.kernels.cuda.arithmetic import (
     add_sum,
     away_from_zero,
     clamp,
     distance_to_plane,
     divide,
-    refract,
     safe_sqrt,
 )
 from dolens.kernels.cuda.axes import change_axes, lens_axes
@@ -76,6 +76,9 @@ from dolens.kernels.cuda.layout import (
     TOTALLY_REFLECTED,
     VIGNETTED,
 )
+from dolens.kernels.cuda.translation import compiled
+
+refract = compiled(refraction.refract)
 
 
 @triton.jit

@@ -9,7 +9,8 @@ N = g/|g| passes its cotangent on to g, and g to P by F's second derivatives and
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import add_sum, divide, refract_adjoint
+from dolens.kernels import refraction
+from dolens.kernels.cuda.arithmetic import add_sum, divide
 from dolens.kernels.cuda.axes import change_axes_adjoint, lens_axes_adjoint
 from dolens.kernels.cuda.functions import LAW_ADJOINT, LAW_CODE
 from dolens.kernels.cuda.layout import (
@@ -30,6 +31,9 @@ from dolens.kernels.cuda.layout import (
     SHIFT,
 )
 from dolens.kernels.cuda.step import shape_sums, surface_gradient
+from dolens.kernels.cuda.translation import compiled
+
+refract_adjoint = compiled(refraction.refract_adjoint)
 
 
 @triton.jit
@@ -64,8 +68,8 @@ def step_adjoint(
         ux, uy, uz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
         if tl.load(codes + REFRACTS) != 0:
             nx, ny, nz = gx * inverse, gy * inverse, gz * inverse
-            a, b, c, vx, vy, vz, of_front, of_behind = refract_adjoint(
-                a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, index
+            a, b, c, vx, vy, vz, of_front, of_behind, _ = refract_adjoint(
+                a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, divide(1.0, index)
             )
             # The cotangent of g: what lies across the normal, over |g|.
             across = vx * nx + vy * ny + vz * nz

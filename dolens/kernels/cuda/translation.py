@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 from dolens.kernels import operations
-from dolens.kernels.cuda.arithmetic import add_sum, divide, safe_sqrt
+from dolens.kernels.cuda.arithmetic import add_sum, clamp, divide, safe_sqrt
 from dolens.kernels.shapes import translated
 
 
@@ -71,8 +71,9 @@ def put(cotangents, place, value):
 _OPERATIONS = {
     getattr(operations, name): made
     for name, made in {
-        "fma": fma, "divide": divide, "sqrt": sqrt, "safe_sqrt": safe_sqrt, "where": where,
-        "zero": zero, "number": number, "length": length, "term": term, "entry": entry, "put": put,
+        "fma": fma, "divide": divide, "sqrt": sqrt, "safe_sqrt": safe_sqrt, "clamp": clamp,
+        "where": where, "zero": zero, "number": number, "length": length, "term": term,
+        "entry": entry, "put": put,
     }.items()
 }  # fmt: skip
 

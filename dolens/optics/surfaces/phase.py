@@ -33,12 +33,12 @@ from dolens.kernels.operations import (
     length,
     put,
     put_powers,
-    safe_sqrt,
     zero,
 )
+from dolens.kernels.refraction import deflect
 from dolens.kernels.shapes import TABLE, PhaseFunctions
 from dolens.kernels.surface_kernel import LawKernel
-from dolens.kernels.table import LONGEST, LONGEST_WAVEVECTOR, STEEPEST, Code
+from dolens.kernels.table import STEEPEST, Code
 from dolens.optics.surfaces.base import Parameters, everywhere, tensor_of
 from dolens.optics.surfaces.deflection import (
     Deflected,
@@ -136,22 +136,9 @@ class Phase(Law):
         # High powers far outside the aperture overflow, and their derivatives are not finite.
         x, y = x.masked_fill(wild, 0.0), y.masked_fill(wild, 0.0)
         phase, gx, gy = cls.phase_and_gradient(p, x, y)
-        gx, gy = scale * gx, scale * gy
-        (l, m, n), (nx, ny, nz) = direction, normal  # noqa: E741
-        ax, ay, az = ratio * l + gx, ratio * m + gy, ratio * n
-        along = (ax * nx + ay * ny + az * nz).clamp(-LONGEST_WAVEVECTOR, LONGEST_WAVEVECTOR)
-        # 1 - |a|² without the cancellation of |d|² = 1: Snell's law where there is no phase.
-        more = gx * (ax + ratio * l) + gy * (ay + ratio * m)
-        squared = (1.0 - ratio * ratio) - more + along * along
-        change = travel.behind * safe_sqrt(squared) - along
-        # Directions of rays that ended stay in single precision's range.
-        return Deflected(
-            torch.addcmul(ax, change, nx).clamp(-LONGEST, LONGEST),
-            torch.addcmul(ay, change, ny).clamp(-LONGEST, LONGEST),
-            torch.addcmul(az, change, nz).clamp(-LONGEST, LONGEST),
-            squared.detach().masked_fill(wild, -1.0),
-            media.per_radian * phase,
-        )
+        *found, squared = deflect(scale * gx, scale * gy, *direction, *normal, ratio, travel.behind)
+        evanescent = squared.detach().masked_fill(wild, -1.0)
+        return Deflected(*found, evanescent, media.per_radian * phase)
 
 
 _Phase = TypeVar("_Phase", bound=Phase)

@@ -2,11 +2,9 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from dolens.kernels.operations import safe_sqrt
-from dolens.kernels.table import LONGEST
+from dolens.kernels.refraction import refract
 
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
@@ -58,17 +56,5 @@ def snell(
     Returns:
         d' = μ·d + (s·cos t - μ·cos i)·N with cos²t = 1 - μ²(1 - cos²i); `transmitted` is cos²t.
     """
-    l, m, n = direction  # noqa: E741
-    nx, ny, nz = normal
-    cosine = torch.addcmul(torch.addcmul(l * nx, m, ny), n, nz)
-    # Only rays that missed have |cos i| > 1; two keeps them finite and rounding unclipped.
-    cosine = cosine.clamp(-LONGEST, LONGEST)
-    squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
-    along = sense * safe_sqrt(squared) - ratio * cosine
-    # Rays that missed have no unit normal; a direction that grew would overflow float32 later.
-    return Refraction(
-        torch.addcmul(ratio * l, along, nx).clamp(-LONGEST, LONGEST),
-        torch.addcmul(ratio * m, along, ny).clamp(-LONGEST, LONGEST),
-        torch.addcmul(ratio * n, along, nz).clamp(-LONGEST, LONGEST),
-        squared.detach(),
-    )
+    l, m, n, squared = refract(*direction, *normal, ratio, sense)  # noqa: E741
+    return Refraction(l, m, n, squared.detach())
