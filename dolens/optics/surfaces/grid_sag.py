@@ -73,9 +73,7 @@ class GridSag(AsphereWithTerms):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Return sag and slopes, and a margin that is positive on the conic and on the grid."""
         sag, sx, sy, exists = EvenAsphere.sag_and_gradient(even_asphere(p), x, y)
-        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
-        spacing = (p["spacing_x"], p["spacing_y"])
-        added, ax, ay = bicubic(nodes, spacing, x - p["decenter_x"], y - p["decenter_y"])
+        added, ax, ay = cls.added_terms(p, x, y)
         half_x, half_y = half_sizes(p)
         inside = torch.minimum(
             half_x - (x - p["decenter_x"]).detach().abs(),
@@ -83,6 +81,13 @@ class GridSag(AsphereWithTerms):
         )
         inside = inside if exists is None else torch.minimum(exists, inside)
         return sag + added, sx + ax, sy + ay, inside
+
+    @classmethod
+    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the grid's sag and slopes."""
+        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
+        spacing = (p["spacing_x"], p["spacing_y"])
+        return bicubic(nodes, spacing, x - p["decenter_x"], y - p["decenter_y"])
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
