@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.materials import MIRROR, is_glass
-from dolens.optics.surfaces.base import PackedShape, Parameters, by_names
+from dolens.optics.surfaces.base import Parameters
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.even_asphere import EvenAsphere, even_asphere
 from dolens.optics.surfaces.plane import Plane
@@ -139,12 +139,15 @@ class Irregular(ZernikeFringe):
     kernel = ZernikeFringe.kernel
 
     @classmethod
-    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the two terms and their slopes."""
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Return sag and slopes, and the margin of the conic's branch."""
+        sag, sx, sy, exists = EvenAsphere.sag_and_gradient(even_asphere(p), x, y)
         square = p["normalization_radius"].square()
         a, b = (p[name] / square for name in ASTIGMATIC)
         slope_x, slope_y = 2.0 * (a * x + b * y), 2.0 * (b * x - a * y)
-        return 0.5 * (x * slope_x + y * slope_y), slope_x, slope_y
+        return sag + 0.5 * (x * slope_x + y * slope_y), sx + slope_x, sy + slope_y, exists
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
@@ -155,9 +158,3 @@ class Irregular(ZernikeFringe):
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
         """Return that of the even asphere."""
         return EvenAsphere.fourth_order_departure(even_asphere(p))
-
-    @classmethod
-    @by_names
-    def packed(cls, p: Parameters) -> PackedShape:
-        """Return what `ZernikeFringe` does."""
-        return super().packed(p)

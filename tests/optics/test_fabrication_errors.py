@@ -177,8 +177,8 @@ def test_an_irregular_surface_is_a_zernike_surface_in_all_but_speed():
     own, known = surface.parameters, ZernikeFringe
     assert issubclass(surface.shape, known) and surface.shape is not known
     x, y = torch.linspace(-6.0, 6.0, 7).double(), torch.linspace(5.0, -4.0, 7).double()
-    pairs = zip(surface.shape.added_terms(own, x, y), known.added_terms(own, x, y), strict=True)
-    for found, expected in pairs:
+    sags = (shape.sag_and_gradient(own, x, y)[:3] for shape in (surface.shape, known))
+    for found, expected in zip(*sags, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-18)
     for name in ("paraxial_curvature", "fourth_order_departure"):
         found, expected = (getattr(shape, name)(own) for shape in (surface.shape, known))
