@@ -146,11 +146,11 @@ class IdealLens(Law):
     ) -> Deflected:
         """Change slopes and path; see the module."""
         before, (x, y, _) = media.before, point
-        *found, path = ideal_lens_forward(
+        l, m, n, path = ideal_lens_forward(  # noqa: E741
             cls.numbers(p, travel.forward), x, y, *direction,
             before, 1.0 / before, before / media.behind, travel.behind,
         )  # fmt: skip
-        return Deflected(*found, None, path)
+        return Deflected(l, m, n, None, path)
 
     @classmethod
     def numbers(cls, p: Parameters, forward: bool = True) -> tuple[Any, ...]:

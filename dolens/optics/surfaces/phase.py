@@ -136,9 +136,11 @@ class Phase(Law):
         # High powers far outside the aperture overflow, and their derivatives are not finite.
         x, y = x.masked_fill(wild, 0.0), y.masked_fill(wild, 0.0)
         phase, gx, gy = cls.phase_and_gradient(p, x, y)
-        *found, squared = deflect(scale * gx, scale * gy, *direction, *normal, ratio, travel.behind)
+        l, m, n, squared = deflect(  # noqa: E741
+            scale * gx, scale * gy, *direction, *normal, ratio, travel.behind
+        )
         evanescent = squared.detach().masked_fill(wild, -1.0)
-        return Deflected(*found, evanescent, media.per_radian * phase)
+        return Deflected(l, m, n, evanescent, media.per_radian * phase)
 
 
 _Phase = TypeVar("_Phase", bound=Phase)
