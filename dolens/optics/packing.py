@@ -117,13 +117,13 @@ def _look_up(system: OpticalSystem, sense: float, first: int, last: int, to_sens
         if law is None:
             laws.append(None)
         else:
-            own = law.law.packed(law.parameters, sense > 0.0)
+            of_law = law.law.packed(law.parameters, sense > 0.0)
             if law.law.kernel is None:
                 raise InputError(f"surface {number}: a {law.law.kind} has no kernel")
             kinds.add(law.law)
-            sizes = _sizes(own.numbers)
-            laws.append(LawForm(law.law.kernel.code, own.count, own.extras, sizes))
-            of_laws += [value for value in own.numbers if value is not None]
+            sizes = _sizes(of_law.numbers)
+            laws.append(LawForm(law.law.kernel.code, of_law.count, of_law.extras, sizes))
+            of_laws += [value for value in of_law.numbers if value is not None]
     scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
     image = None
     if to_sensor and system.image is not None:

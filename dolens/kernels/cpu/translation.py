@@ -95,7 +95,6 @@ def operations_of(real: types.Type) -> dict[Any, Any]:
 
         return types.void(cotangents, types.int64, value), generate
 
-    own = (fma, divide, sqrt, where, zero, number, length, term, entry, put)
     tiny = real(TINY)
 
     @njit(**OPTIONS)
@@ -110,7 +109,10 @@ def operations_of(real: types.Type) -> dict[Any, Any]:
         value = low if value < low else value
         return limit if value > limit else value
 
-    own = (*own, safe_sqrt, clamp)
+    own = (
+        *(fma, divide, sqrt, where, zero, number, length, term, entry, put),
+        *(safe_sqrt, clamp),
+    )
     return {getattr(operations, one.__name__): one for one in own}
 
 

@@ -111,7 +111,7 @@ class ZernikePhase(Phase):
         The coefficient of the constant makes the phase zero in the middle, where P_k = (-1)^k.
         """
         found: dict[tuple[int, int, bool], Any] = {}
-        middle = 0.0
+        middle: Any = 0.0
         for name, value in p.items():
             match = _TERM.fullmatch(name)
             if match is None:
