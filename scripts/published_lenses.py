@@ -3,8 +3,8 @@
     python scripts/published_lenses.py              # both
     python scripts/published_lenses.py --table      # the table alone
 
-The table is made from the files of conf/lens/published alone; tests/test_lens_table.py holds it to
-them.
+The table is made from the files of conf/lens/published alone;
+tests/scripts/test_published_lenses.py holds it to them.
 """
 
 import argparse

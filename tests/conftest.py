@@ -23,7 +23,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Those of whole commands and documents first: none of them is left over at the end, when one
     process would wait for the other.
     """
-    items.sort(key=lambda item: item.path.parent != ROOT / "tests")
+    first = ROOT / "tests", ROOT / "tests/scripts", ROOT / "tests/cli"
+    items.sort(key=lambda item: item.path.parent not in first)
 
 
 def pytest_collection_finish():

@@ -20,6 +20,7 @@ COMMAND = re.compile(rf"(?:[A-Z_]+=\S+ )*(?:{PROGRAMS}) ")
 
 class Block(NamedTuple):
     page: str
+    section: str  # the heading of second order above it
     language: str  # "sh" of indented commands, "yaml" of other indented ones
     title: str
     text: str
@@ -32,6 +33,7 @@ class Block(NamedTuple):
 def blocks_of(document):
     """The blocks of a document in order; `my_folder/<path>` before one is its title."""
     found, text = [], document.read_text(encoding="utf-8")
+    page = str(document.relative_to(ROOT))
     for match in BLOCK.finditer(text):
         before = text[: match.start()].rstrip().rpartition("\n")[2]
         named = re.fullmatch(r"`(my_\w+/[\w./]+)`:", before)
@@ -41,7 +43,8 @@ def blocks_of(document):
             content = textwrap.dedent(match["indented"]).rstrip() + "\n"
             language = "sh" if COMMAND.match(content) and not title else "yaml"
         language = {"bash": "sh"}.get(language, language)
-        found.append(Block(str(document.relative_to(ROOT)), language, title, content))
+        section = re.findall(r"^## (.*)$", text[: match.start()], re.MULTILINE)[-1:]
+        found.append(Block(page, *section or [""], language, title, content))
     return found
 
 

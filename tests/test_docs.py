@@ -3,13 +3,10 @@
 import ast
 import importlib
 import re
-import shlex
 from decimal import Decimal
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -26,20 +23,6 @@ NAMES = sorted(
             rf"`((?:dolens|torch|{'|'.join(PARTS)})(?:\.\w+)+)`", source.read_text(encoding="utf-8")
         )
         if not name.endswith((".py", ".txt", ".html"))
-    }
-)
-COMMANDS = sorted(set(re.findall(r"`(experiment=[^`]+)`", SUPPLEMENT)))
-# Commands of the other documents that run packaged experiments: each a line of its own.
-TRAININGS = sorted(
-    {
-        line
-        for document in DOCUMENTS
-        for line in re.findall(
-            r"^    dolens train ([^#\n]*experiment=[^#\n]*)",
-            document.read_text(encoding="utf-8"),
-            re.MULTILINE,
-        )
-        if not re.search(r"\\|my_camera|near_field|mylens|quartet|-m\b|\.\.\.|NAME", line)
     }
 )
 # Packages whose docstrings follow the rules of docs/glossary.md.
@@ -66,25 +49,6 @@ def resolved(name):
 def test_a_dotted_name_of_documents_and_docstrings_is_in_the_code(name):
     own = name.partition(".")[0] in PARTS
     resolved(f"dolens.{name}" if own else name)
-
-
-@pytest.fixture(scope="module")
-def configuration():
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        yield
-    GlobalHydra.instance().clear()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_an_experiment_of_the_supplement_composes(configuration, command):
-    cfg = compose("train", shlex.split(command))
-    assert cfg.module._target_.startswith("dolens.experiments.")
-
-
-@pytest.mark.parametrize("command", TRAININGS)
-def test_a_command_of_a_tutorial_composes(configuration, command):
-    overrides = [part for part in shlex.split(command) if not part.startswith("--")]
-    assert compose("train", overrides).module._target_.startswith("dolens.experiments.")
 
 
 def test_the_supplement_is_complete():

@@ -1,6 +1,5 @@
 """The examples of docs/extending.md do what the document says when they are run as printed."""
 
-import csv
 import json
 import os
 import re
@@ -8,36 +7,24 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import yaml
 
+from tests import printed
+from tests.experiments.runs import rows_of
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
-FENCE = re.compile(r'^```(\w*)(?: title="(.*?)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
-
-
-class Block(NamedTuple):
-    section: str
-    language: str
-    path: str
-    text: str
-
-
-def blocks_of(document):
-    """The fenced blocks in order, each with the heading of its section."""
-    found = []
-    for part in re.split(r"^## ", document, flags=re.MULTILINE):
-        section = part.partition("\n")[0]
-        found += [Block(section, *match) for match in FENCE.findall(part)]
-    return found
-
-
-BLOCKS = blocks_of(DOCUMENT)
-FILES = {block.path: block.text for block in BLOCKS if block.path}
+# All but the last, which runs these tests.
+BLOCKS = [
+    block
+    for block in printed.BLOCKS
+    if block.page == "docs/extending.md" and not block.text.startswith("python -m pytest")
+]
+FILES = {block.title: block.text for block in BLOCKS if block.title}
 COMMANDS = [block for block in BLOCKS if block.language == "sh"]
-SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block.path]
+SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block.title]
 # A command, and the experiment that it runs.
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
@@ -106,12 +93,6 @@ def ended(checkout):
     return *(json.loads((checkout / f"ends{n}.json").read_text()) for n in (0, 1)), said
 
 
-def table(path):
-    """The rows of a CSV file."""
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def a_camera_of_nearer_objects_with_its_network_and_loss(folder, metrics):
     assert {"test/psnr_db/worst", "test/psnr_db/6m", "test/psnr_db/5m"} <= set(metrics)
     plate = yaml.safe_load((folder / "lens/final.yaml").read_text())["surfaces"]["5"]
@@ -131,7 +112,7 @@ def a_design_with_less_astigmatism(folder, metrics):
 
 def an_operand_in_the_history(folder, metrics):
     columns = {f"{kind}/telephoto_ratio" for kind in ("operand", "operand_slope", "merit")}
-    assert columns <= set(table(folder / "history.csv")[0])
+    assert columns <= set(rows_of(folder / "history.csv")[0])
     assert "telephoto_ratio" in (folder / "operands.csv").read_text()
 
 
@@ -141,7 +122,7 @@ def a_camera_trained_with_another_renderer(folder, metrics):
 
 
 def a_number_a_table_and_a_figure(folder, metrics):
-    rows = table(folder / "chromatic_focus.csv")
+    rows = rows_of(folder / "chromatic_focus.csv")
     distances = [float(row["bfd_mm"]) for row in rows]
     spread = max(distances) - min(distances)
     assert metrics["chromatic_focus/range_mm"] == pytest.approx(spread, abs=2e-4)
@@ -180,9 +161,9 @@ def test_every_command_has_a_promise():
 
 def test_every_block_is_a_file_or_is_run():
     """A block that is neither would be an example that nobody has tried."""
-    assert len(FILES) == sum(bool(block.path) for block in BLOCKS)  # no file is printed twice
+    assert len(FILES) == sum(bool(block.title) for block in BLOCKS)  # no file is printed twice
     for block in BLOCKS:
-        assert block.path.startswith("mine/") or block.language in ("sh", "python"), block
+        assert block.title.startswith("mine/") or block.language in ("sh", "python"), block
 
 
 def test_the_table_names_the_files_of_the_document_and_counts_them():

@@ -42,8 +42,8 @@ PLACEHOLDER = re.compile(r"\.\.\.|…|\b(?:NAME|LENS|FOLDER|A B)\b(?!/)|\[key=")
 ALONE = ("experiments", "report")
 # Pages take seconds: one is written, and of the others the arguments are tried.
 FIRST_PAGE = ("dolens", "show", "cooke_triplet", "--html", "triplet.html")
-# Of a page's Python: sizes of an hour's work, and processes that tests/experiments/test_workers.py
-# starts.
+# Of a page's Python: sizes of an hour's work, and processes, which
+# tests/experiments/workers/test_workers.py starts.
 SIZES = {"draw(100_000,": "draw(1_000,", "workers_of(2)": "workers_of(0)"}
 OTHERS = (
     ".venv/bin/pip",

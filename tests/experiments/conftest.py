@@ -1,7 +1,10 @@
+import logging
 import pickle
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -18,10 +21,13 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
-from dolens.experiments.running.training import run
+from dolens.experiments.experiment import Experiment
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_module, run
 from dolens.experiments.workers import workers
 from dolens.tasks import in_turn
-from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
+from tests.experiments.runs import Finished
+from tests.experiments.tiny_experiment import CAMERA, TRAINED
 
 
 @pytest.fixture
@@ -52,13 +58,17 @@ def load_once(repository: ConfigRepository, config_path: str) -> ConfigResult | 
 
 @contextmanager
 def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
-    """A function that composes an experiment with its run folder under a parent."""
+    """A function that composes an experiment with its run folder under a parent.
 
-    def build(*overrides: str, folder: str = "run") -> DictConfig:
+    Settings by name take the places of those that the overrides lead to.
+    """
+
+    def build(*overrides: str, folder: str = "run", **settings: Any) -> DictConfig:
         cfg = compose("train", list(overrides), return_hydra_config=True)
         output = parent / folder
         output.mkdir(exist_ok=True)
         with open_dict(cfg):
+            cfg.update(settings)
             cfg.hydra.runtime.output_dir = str(output)
             cfg.hydra.job.num = 0
         HydraConfig.instance().set_config(cfg)
@@ -73,19 +83,49 @@ def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
     HydraConfig.instance().cfg = None
 
 
+@pytest.fixture
+def trained(composed: Callable[..., DictConfig], tmp_path: Path) -> Callable[..., Finished]:
+    """Run an experiment with overrides, as `composed` takes them, to its end."""
+
+    def train(*overrides: str, folder: str = "run", **settings: Any) -> Finished:
+        objective = run(composed(*overrides, folder=folder, **settings))
+        return Finished(tmp_path / folder, objective)
+
+    return train
+
+
+@pytest.fixture
+def made(composed: Callable[..., DictConfig]) -> Callable[..., Experiment]:
+    """Make the module of an experiment, with its lens, and train nothing."""
+    return lambda *overrides: build_module(RunSettings.of(composed(*overrides)))
+
+
 @pytest.fixture(scope="session")
 def tiny_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run of a tiny camera; tests copy it, and write nothing into it."""
-    return finished_run(root, tmp_path_factory.mktemp("finished"), *TINY_CAMERA)
+    return finished_run(root, tmp_path_factory.mktemp("finished"), *TRAINED)
 
 
-TINY_CAMERA = (
-    "experiment=wavefront_coding",
-    *TINY,
-    *TINY_NETWORK,
-    "trainer.max_epochs=1",
-    "learning_rates.network=0.05",
-)
+@pytest.fixture
+def run_copy(tiny_run: Path, tmp_path: Path) -> Path:
+    """A copy of the run, to be changed."""
+    return Path(shutil.copytree(tiny_run, tmp_path / "run"))
+
+
+@pytest.fixture(scope="session")
+def two_epochs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A tiny camera after two epochs of two steps, with pictures, and what its log said."""
+    log, said = logging.getLogger("dolens"), []
+    handler, level = logging.Handler(), log.level
+    handler.emit = lambda record: said.append(record.getMessage())
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    parent = tmp_path_factory.mktemp("two_epochs")
+    with composing(root, parent) as build:
+        objective = run(build(*CAMERA))
+    log.removeHandler(handler)
+    log.setLevel(level)
+    return Finished(parent / "run", objective, tuple(said))
 
 
 def finished_run(root: Path, parent: Path, *overrides: str, name: str = "run") -> Path:

@@ -1,15 +1,13 @@
 """The contract between a run and its module: what a run refuses, and what an analysis leaves."""
 
-import json
-
 import lightning
 import pytest
 import torch
 from matplotlib.figure import Figure
 
 from dolens.experiments.experiment import Analysis
-from dolens.experiments.running.training import run
-from tests.experiments.run_tables import table
+from tests.experiments.runs import Finished
+from tests.experiments.tiny_experiment import QUIET
 
 EXPERIMENT = """
 # @package _global_
@@ -84,43 +82,43 @@ class Bare(lightning.LightningModule):
 
 
 @pytest.fixture
-def own(composed, tmp_path):
-    """Compose an experiment that a user keeps beside the repository, with a module of his own."""
+def own(trained, tmp_path):
+    """Run an experiment that a user keeps beside the repository, with a module of his own."""
 
     def build(module, *overrides):
         (tmp_path / "experiment").mkdir(exist_ok=True)
         text = EXPERIMENT.format(target=f"{__name__}.{module}")
         (tmp_path / "experiment/chromatic.yaml").write_text(text)
-        quiet = ["+trainer.enable_progress_bar=false", f"hydra.searchpath=[file://{tmp_path}]"]
-        return composed("experiment=chromatic", *quiet, *overrides)
+        quiet = [QUIET, f"hydra.searchpath=[file://{tmp_path}]"]
+        return trained("experiment=chromatic", *quiet, *overrides)
 
     return build
 
 
-def test_an_analysis_of_ones_own_leaves_its_numbers_tables_and_figures(own, tmp_path):
-    spread = run(own("FocalLengths"))
-    folder = tmp_path / "run"
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["efl_mm/spread"] == spread > 0.0
-    rows = table(folder, "focal_lengths")
+def test_an_analysis_of_ones_own_leaves_its_numbers_tables_and_figures(own):
+    found = own("FocalLengths")
+    folder, spread = found.folder, found.objective
+    assert found.metrics["efl_mm/spread"] == spread > 0.0
+    rows = found.table("focal_lengths")
     lengths = [float(row["efl_mm"]) for row in rows]
     assert [row["wavelength_nm"] for row in rows] == ["486.1", "587.6", "656.3"]
     assert max(lengths) - min(lengths) == pytest.approx(spread, abs=2e-4)  # six digits
     assert not (folder / "nothing.csv").exists()
     assert [path.name for path in (folder / "figures").iterdir()] == ["focal_lengths.png"]
-    assert json.loads((folder / "run.json").read_text())["status"] == "finished"
+    assert found.info["status"] == "finished"
 
 
 def test_an_analysis_may_differentiate(own):
     # Φ grows with the first curvature: its surface and those behind it add up.
-    assert run(own("Power")) > 0.0
+    assert own("Power").objective > 0.0
 
 
 def test_what_was_written_stays_when_a_later_part_fails(own, tmp_path):
     with pytest.raises(ValueError, match="red"):
-        run(own("FocalLengths", "wavelengths=[587.6,red]"))
-    assert len(table(tmp_path / "run", "focal_lengths")) == 1
-    assert json.loads((tmp_path / "run/run.json").read_text())["status"] == "failed"
+        own("FocalLengths", "wavelengths=[587.6,red]")
+    found = Finished(tmp_path / "run")
+    assert len(found.table("focal_lengths")) == 1
+    assert found.info["status"] == "failed"
 
 
 REFUSED = {
@@ -142,7 +140,7 @@ REFUSED = {
 def test_what_a_run_cannot_do_is_one_clear_line(own, case):
     module, overrides, expected = REFUSED[case]
     with pytest.raises(ValueError) as caught:
-        run(own(module, *overrides))
+        own(module, *overrides)
     assert expected in str(caught.value) and "\n" not in str(caught.value)
 
 

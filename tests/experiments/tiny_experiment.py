@@ -1,8 +1,21 @@
 """Experiments at a size that trains in seconds; the path is the same."""
 
-from pathlib import Path
-
+QUIET = "+trainer.enable_progress_bar=false"
+UNPICTURED = "callbacks.pictures=null"
+UNTESTED = [UNPICTURED, "test=false", "objective=train/loss"]
+ONE_EPOCH = "trainer.max_epochs=1"
+SHORT = [
+    "data.evaluation_crops_per_photograph=1",
+    "data.steps_per_epoch=2",
+    "trainer.max_epochs=2",
+    "+trainer.limit_val_batches=1",
+    "+trainer.limit_test_batches=1",
+    "trainer.log_every_n_steps=1",
+    "loss.perceptual=none",
+    QUIET,
+]
 TINY = [
+    *SHORT,
     "renderer.sensor.height=24",
     "renderer.sensor.width=24",
     "renderer=rays",
@@ -13,18 +26,14 @@ TINY = [
     "views.psf_size=33",
     "views.psf_pupil_samples=8",
     "data.margin=16",
-    "data.evaluation_crops_per_photograph=1",
-    "data.steps_per_epoch=2",
-    "trainer.max_epochs=2",
-    "+trainer.limit_val_batches=1",
-    "+trainer.limit_test_batches=1",
-    "+trainer.enable_progress_bar=false",
-    "trainer.log_every_n_steps=1",
-    "loss.perceptual=none",
 ]
 TINY_NETWORK = ["network=feature_wiener", "network.width=4", "network.depth=2"]
+CAMERA = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK]
+# The camera of `tiny_run`, whose network moves.
+TRAINED = [*CAMERA, ONE_EPOCH, "learning_rates.network=0.05"]
 
 TINY_DOUBLET = [
+    *SHORT,
     "experiment=large_fov_doublet",
     "renderer.sensor.height=32",
     "renderer.sensor.width=32",
@@ -33,24 +42,9 @@ TINY_DOUBLET = [
     "evaluation_renderer=rays",
     "evaluation_renderer.pupil_samples=2",
     "data.margin=12",
-    "data.steps_per_epoch=2",
-    "data.evaluation_crops_per_photograph=1",
-    "trainer.max_epochs=2",
-    "+trainer.limit_val_batches=1",
-    "+trainer.limit_test_batches=1",
-    "+trainer.enable_progress_bar=false",
-    "trainer.log_every_n_steps=1",
     "optimizer.lens=adam",
     "network=field_pyramid",
     "network.width_multiplier=0.25",
     "network.weights=none",
-    "loss.perceptual=none",
 ]
 FIXED_WINDOWS = ["renderer.fields=[1,1]"]
-
-
-def figure_names(folder: Path) -> set[str]:
-    """The figures that a run left, none of them empty."""
-    files = list((folder / "figures").iterdir())
-    assert all(file.suffix == ".png" and file.stat().st_size > 5000 for file in files), files
-    return {file.stem for file in files}

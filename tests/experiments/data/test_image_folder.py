@@ -157,6 +157,10 @@ def test_hopeless_folders_are_named(tmp_path):
         _data(tmp_path / "none").setup()
     with pytest.raises(InputError, match=r"no images in this folder; allowed: .*\.jpg"):
         _data(tmp_path).setup()
+    _image(tmp_path / "alone.png")
+    with pytest.raises(InputError, match="is not a folder"):
+        _data(tmp_path / "alone.png").setup()
+    (tmp_path / "alone.png").unlink()
     for number in range(4):
         (tmp_path / f"{number}.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"none of 4 files is a readable image; allowed: .*\.jpg"):

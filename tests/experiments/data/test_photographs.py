@@ -104,15 +104,3 @@ def test_listing_is_recursive_sorted_and_finite(tmp_path):
     index = IndexFile(tmp_path, EXTENSIONS).index()
     assert list(index.names) == ["a.jpeg", "b/1.png", "b/c/2.JPG"]
     assert len(IndexFile(tmp_path, normalised_extensions(["PNG"])).index()) == 1
-
-
-def test_empty_and_missing_folders_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"no images in this folder; allowed: .*\.png"):
-        IndexFile(tmp_path, EXTENSIONS).index()
-    with pytest.raises(InputError, match=r"none: does not exist; allowed: .*\.png"):
-        IndexFile(tmp_path / "none", EXTENSIONS).index()
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="is not a folder"):
-        IndexFile(tmp_path / "file", EXTENSIONS).index()
-    with pytest.raises(InputError, match=r"data\.extensions"):
-        normalised_extensions([])

@@ -1,6 +1,5 @@
 """Photographs inside other files: found by their place, known by their hashes."""
 
-import csv
 import gzip
 import hashlib
 import io
@@ -18,6 +17,7 @@ from dolens.experiments.data.pretraining_photographs import (
     pretraining_photographs,
     read_members,
 )
+from tests.experiments.data.test_package_photographs import manifest
 
 COLUMNS = (
     *("package", "version", "path", "member", "offset", "length"),
@@ -56,16 +56,13 @@ def _install(share):
     return [pixels for pixels, _ in pictures], rows
 
 
-def _manifest(folder, rows):
-    path = folder / "list.csv"
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([COLUMNS, *rows])
-    return path
+def _listed(folder, rows):
+    return manifest(folder, rows, COLUMNS)
 
 
 def test_photographs_are_taken_out_of_what_holds_them(tmp_path):
     pictures, rows = _install(tmp_path / "share")
-    found = pretraining_photographs([tmp_path, tmp_path / "share"], _manifest(tmp_path, rows))
+    found = pretraining_photographs([tmp_path, tmp_path / "share"], _listed(tmp_path, rows))
     for (photograph, _), pixels in zip(found, pictures, strict=True):
         assert torch.equal(photograph.encoded, torch.from_numpy(pixels).permute(2, 0, 1))
     assert [weight for _, weight in found] == [1.0, 0.3, 1.0, 1.0]
@@ -80,7 +77,7 @@ def test_photographs_are_taken_out_of_what_holds_them(tmp_path):
 def test_the_list_says_how_far_each_is_shrunk(tmp_path):
     pictures, rows = _install(tmp_path / "share")
     rows[0][COLUMNS.index("shrink")] = 12
-    (photograph, _), *_ = pretraining_photographs([tmp_path / "share"], _manifest(tmp_path, rows))
+    (photograph, _), *_ = pretraining_photographs([tmp_path / "share"], _listed(tmp_path, rows))
     encoded = pictures[0][:12, :12].astype(float) / 255.0
     light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     mean = light.mean((0, 1))  # of noise: far above the straight part of the curve
@@ -96,14 +93,14 @@ def test_an_altered_file_is_refused(tmp_path, path, content):
     _, rows = _install(tmp_path / "share")
     (tmp_path / "share" / path).write_bytes(content)
     with pytest.raises(InputError, match=rf"{path}: not the file .* a-package, version 1\.0-1"):
-        pretraining_photographs([tmp_path / "share"], _manifest(tmp_path, rows))
+        pretraining_photographs([tmp_path / "share"], _listed(tmp_path, rows))
 
 
 def test_a_missing_file_names_itself_and_the_package(tmp_path):
     _, rows = _install(tmp_path / "share")
     (tmp_path / "share/theme.edj").unlink()
     with pytest.raises(InputError, match=r"theme\.edj: missing .* packages a-package"):
-        pretraining_photographs([tmp_path / "share"], _manifest(tmp_path, rows))
+        pretraining_photographs([tmp_path / "share"], _listed(tmp_path, rows))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +117,7 @@ def test_a_wrong_list_names_its_line(tmp_path, column, value, words):
     _, rows = _install(tmp_path / "share")
     rows[1][COLUMNS.index(column)] = value
     with pytest.raises(InputError, match=words):
-        read_members(_manifest(tmp_path, rows))
+        read_members(_listed(tmp_path, rows))
 
 
 def test_the_projects_list_keeps_out_what_is_validated_and_tested_on():

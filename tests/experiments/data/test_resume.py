@@ -18,13 +18,8 @@ pytestmark = pytest.mark.filterwarnings(
 class _Data(CropDataModule):
     def load_split(self, split):
         generator = torch.Generator().manual_seed(len(split))
-        return [
-            Photograph(
-                f"{split} {number}",
-                torch.randint(0, 256, (3, 16, 16), generator=generator, dtype=torch.uint8),
-            )
-            for number in range(3)
-        ]
+        encoded = torch.randint(0, 256, (3, 3, 16, 16), generator=generator, dtype=torch.uint8)
+        return [Photograph(f"{split} {number}", one) for number, one in enumerate(encoded)]
 
 
 class _Linear(lightning.LightningModule):
@@ -156,20 +151,26 @@ def test_an_interrupted_batch_is_seen_again(whole, tmp_path):
     _same(resumed, module, 7)
 
 
-@pytest.mark.parametrize("step", [2, 4, 5, 6])
-def test_resuming_with_validation_in_between(tmp_path, step):
-    options = {"val_check_interval": 2}
-    module, _ = _fit(tmp_path, callbacks=[_every_step(tmp_path)], **options)
-    resumed, _ = _fit(tmp_path, resume=tmp_path / f"step={step}.ckpt", **options)
-    _same(resumed, module, step)
+# Options of the trainer and of the data, steps to resume from, and batches of a step.
+RUNS = {
+    "with validation in between": ({"val_check_interval": 2}, {}, (2, 4, 5, 6), 1),
+    "limited by steps": ({"max_steps": 12}, {}, (3, 5, 7), 1),
+    "of fewer batches": ({"limit_train_batches": 3}, {}, (2,), 1),
+    "by accumulated gradients": ({"accumulate_grad_batches": 2}, {"steps_per_epoch": 6}, (2,), 2),
+}
 
 
-@pytest.mark.parametrize("step", [3, 5, 7])
-def test_resuming_a_run_limited_by_steps(tmp_path, step):
-    options = {"max_steps": 12}
-    module, _ = _fit(tmp_path, callbacks=[_every_step(tmp_path)], **options)
-    resumed, _ = _fit(tmp_path, resume=tmp_path / f"step={step}.ckpt", **options)
-    _same(resumed, module, step)
+@pytest.mark.parametrize("case", RUNS)
+def test_resuming_other_runs(tmp_path, case):
+    options, data, steps, batches = RUNS[case]
+    module, _ = _fit(tmp_path, _data(**data), callbacks=[_every_step(tmp_path)], **options)
+    dataset = _data().train_dataloader().dataset
+    expected = torch.stack([dataset[index] for index in range(2 * len(module.seen))])
+    assert torch.equal(torch.cat(module.seen), expected)  # no sample is wasted
+    for step in steps:
+        checkpoint = tmp_path / f"step={step}.ckpt"
+        resumed, _ = _fit(tmp_path / "again", _data(**data), resume=checkpoint, **options)
+        _same(resumed, module, batches * step)
 
 
 @pytest.mark.parametrize("step", [2, 4])
@@ -192,25 +193,6 @@ def test_samples_outlive_a_slip_of_lightning_in_the_count_of_epochs(tmp_path):
     resumed, _ = _fit(tmp_path, resume=tmp_path / "step=5.ckpt", **options)
     assert torch.equal(torch.stack(resumed.seen), torch.stack(module.seen[5:]))
     assert torch.equal(resumed.layer.weight, module.layer.weight)
-
-
-def test_a_limit_on_batches_wastes_no_samples(tmp_path):
-    options = {"limit_train_batches": 3}
-    module, _ = _fit(tmp_path, callbacks=[_every_step(tmp_path)], **options)
-    dataset = _data().train_dataloader().dataset
-    expected = torch.stack([dataset[index] for index in range(12)])
-    assert torch.equal(torch.cat(module.seen), expected)
-    resumed, _ = _fit(tmp_path, resume=tmp_path / "step=2.ckpt", **options)
-    _same(resumed, module, 2)
-
-
-def test_accumulated_gradients_count_batches_not_steps(tmp_path):
-    options = {"accumulate_grad_batches": 2}
-    data = {"steps_per_epoch": 6}
-    module, _ = _fit(tmp_path, _data(**data), callbacks=[_every_step(tmp_path)], **options)
-    assert len(module.seen) == 2 * 6
-    resumed, _ = _fit(tmp_path, _data(**data), resume=tmp_path / "step=2.ckpt", **options)
-    _same(resumed, module, 4)
 
 
 def test_resuming_with_other_samples_is_said(whole, tmp_path, caplog):

@@ -1,7 +1,5 @@
 """Photographs with depth maps beside them, and a camera trained on them."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -11,10 +9,9 @@ from dolens.errors import InputError
 from dolens.experiments.data.crops import centred_crop, random_crop
 from dolens.experiments.data.image_folder import RgbdFolderDataModule, read_depth_map
 from dolens.experiments.data.photographs import Photograph
-from dolens.experiments.running.training import run
 from dolens.rendering.auto.probes import probe_texture
 from dolens.sensor.pixels import Sensor
-from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
+from tests.experiments.tiny_experiment import CAMERA
 
 
 def write(folder, name, depth, ending="png"):
@@ -148,20 +145,9 @@ def test_a_renderer_that_chooses_is_tried_on_colours_alone(tmp_path):
     assert probe_texture(sensor, 3, 0, data.most_detailed()).shape == (3, 3, 74, 74)
 
 
-def test_a_camera_is_trained_on_a_folder(composed, tmp_path):
+def test_a_camera_is_trained_on_a_folder(trained, tmp_path):
     for number in range(4):
         write(tmp_path / "scenes", f"scene{number}", ramp(120, 160))
-    settings = [s for s in TINY if not s.startswith("data=")]
-    run(
-        composed(
-            "experiment=wavefront_coding",
-            "scene=layers",
-            "views=layers",
-            "data=rgbd_folder",
-            f"data.root={tmp_path / 'scenes'}",
-            *settings,
-            *TINY_NETWORK,
-        )
-    )
-    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    layers = ("scene=layers", "views=layers", "data=rgbd_folder")
+    metrics = trained(*CAMERA, *layers, f"data.root={tmp_path / 'scenes'}").metrics
     assert 0.0 < metrics["test/psnr_db/4.5-8m"] < 60.0

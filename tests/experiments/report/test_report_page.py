@@ -16,7 +16,14 @@ from dolens.experiments.report.page.overview import (
     value_text,
 )
 from dolens.experiments.report.page.page import page
-from dolens.experiments.report.runs import assigned, gain_numbers, read_result, same_overrides
+from dolens.experiments.report.prescriptions import load_golden_rays, trace_errors
+from dolens.experiments.report.runs import (
+    assigned,
+    code_fingerprint,
+    gain_numbers,
+    read_result,
+    same_overrides,
+)
 from dolens.html import element, prose
 from tests.experiments.report.report_runs import CHECKS, PLAN, finished_run
 
@@ -119,12 +126,9 @@ def test_finished_runs_are_taken_by_their_overrides(tmp_path):
         assigned(PLAN, [str(tmp_path / "b")])
     with pytest.raises(InputError, match="not the folder of a finished run"):
         assigned(PLAN, [f"other={tmp_path}"])
-
-
-def test_a_run_that_stopped_is_not_finished(tmp_path):
-    finished_run(tmp_path / "a", status="interrupted")
+    finished_run(tmp_path / "stopped/a", status="interrupted")
     with pytest.raises(InputError, match="no finished run"):
-        assigned(PLAN, [str(tmp_path)])
+        assigned(PLAN, [str(tmp_path / "stopped")])
 
 
 def test_the_seed_counts_and_the_threads_do_not():
@@ -164,8 +168,6 @@ def test_a_gain_is_said_with_its_interval(low, high, verdict):
 
 
 def test_the_fingerprint_is_short_and_stable():
-    from dolens.experiments.report.runs import code_fingerprint
-
     first = code_fingerprint()
     code_fingerprint.cache_clear()
     assert code_fingerprint() == first and len(first) == 12
@@ -173,8 +175,6 @@ def test_the_fingerprint_is_short_and_stable():
 
 def test_the_golden_rays_are_met():
     """One bundle; the report traces them all."""
-    from dolens.experiments.report.prescriptions import load_golden_rays, trace_errors
-
     bundles = [bundle for bundle in load_golden_rays() if bundle["name"] == "cooke_triplet_tilted"]
     assert trace_errors(bundles)["trace_error_nm/cooke_triplet_tilted"] < 1e-5
     assert torch.is_grad_enabled() and json.dumps(bundles[0]["elements"])

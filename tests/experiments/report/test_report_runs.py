@@ -70,7 +70,6 @@ def plan(tmp_path, monkeypatch):
         Check("S1", "fails", "number", "one", "exact", "s", 1.0, 0.1),
     )
     monkeypatch.setattr(session, "load_checks", lambda plan: checks)
-    monkeypatch.setattr(session, "load_checks", lambda plan: checks)
     return Plan(systems, (), (Section("One", (item,)),))
 
 
