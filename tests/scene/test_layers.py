@@ -211,7 +211,8 @@ def test_an_edge_in_front_of_an_edge_is_that_of_a_thin_lens(
     opacity = np.clip(edge + 1 - (place + near * disc()), 0.0, 1.0)
     background = 0.9 - 0.4 * np.clip(place + far * disc() - step, 0.0, 1.0)
     expected = (0.2 * opacity + (1.0 - opacity) * background).mean((1, 2))
-    sensor = Sensor(4, width, pitch)
+    # Rows are alike but for their rays; of many planes two are enough for the looser tolerance.
+    sensor = Sensor(4 if planes == "own" else 2, width, pitch)
     scene = LayeredScene((NEAR, FAR), GREEN)
     if planes == "even":
         # A pixel of blur from plane to plane, and the scene between them: linear interpolation of
