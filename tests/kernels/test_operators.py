@@ -149,14 +149,6 @@ def test_gradient_with_respect_to_the_wavelength(root):
     assert float(slope) == pytest.approx(float(expected.detach()), rel=1e-6)
 
 
-def test_no_rays_are_no_trouble(lens):
-    empty = torch.empty((0, 3), dtype=lens.dtype)
-    hit = lens.trace(Rays(empty, empty, 550.0))
-    assert hit.position.shape == (0, 3) and hit.valid.shape == (0,)
-    hit.position.sum().backward()
-    assert float(lens.surfaces["1"].curvature.grad) == 0.0
-
-
 def test_nan_infinity_and_denormals_stay_in_their_own_ray(lens):
     """In the middle of a block: neighbours, their gradients and statuses do not notice."""
     rays = bundle(lens, 300)

@@ -32,9 +32,9 @@ class Errors:
     gradient_roundings: float
 
 
-def measure(case, dtype):
+def measure(case, dtype, backend="auto"):
     """Trace the rays of a case, and compare values and gradients of all parameters."""
-    lens = lens_from_prescription(case.prescription(), dtype)
+    lens = lens_from_prescription(case.prescription(), dtype, backend=backend)
     rows = [
         _one_ray(lens, _exactly(case, i, dtype), *ray, dtype) for i, ray in enumerate(case.rays)
     ]

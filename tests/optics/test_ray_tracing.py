@@ -256,14 +256,3 @@ def test_a_source_at_a_hundred_kilometres_is_at_infinity(bent_lens):
     # Rounding of an origin at 1e8 mm is 1.5e-8 mm.
     assert (results[0][0] - results[1][0]).abs().max() < 1e-7
     assert float(results[0][1]) == pytest.approx(float(results[1][1]), rel=1e-7)
-
-
-@both
-def test_leading_shapes_and_wavelengths_broadcast(bent_lens):
-    rays = passing(bent_lens)
-    wavelengths = torch.tensor([[656.2725], [486.1327]], dtype=torch.float64)
-    hit = bent_lens.trace(Rays(rays.position, rays.direction, wavelengths), record=True)
-    assert hit.position.shape == (2, len(rays.position), 3)
-    for row, wavelength in zip(hit.position, wavelengths, strict=True):
-        alone = bent_lens.trace(Rays(rays.position, rays.direction, float(wavelength)))
-        assert (alone.position - row).abs().max() < 1e-13

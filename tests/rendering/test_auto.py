@@ -32,11 +32,6 @@ from dolens.sensor.pixels import Sensor
 LINES = (656.2725, 587.5618, 486.1327)
 
 
-@pytest.fixture
-def backend():
-    return "auto"
-
-
 def coded(root, dtype=torch.float32):
     lens = load_lens(root / "conf/lens/wavefront_coding.yaml", dtype=dtype)
     with torch.no_grad():

@@ -37,12 +37,6 @@ POSED_LENS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def backend():
-    """Lenses leave the choice open: these tests compare both."""
-    return "auto"
-
-
 def texture(size, images=1, channels=3, dtype=torch.float64):
     """Smooth, so that float32's coordinates do not decide which texel's slope is seen."""
     generator = torch.Generator().manual_seed(4)

@@ -12,12 +12,6 @@ from dolens.sensor.pixels import Sensor
 LINES = (656.2725, 587.5618, 486.1327)
 
 
-@pytest.fixture
-def backend():
-    """Lenses leave the choice open: these tests compare both."""
-    return "auto"
-
-
 def points(count, size, dtype=torch.float64):
     generator = torch.Generator().manual_seed(7)
     drawn = torch.rand(3, count, generator=generator, dtype=dtype)

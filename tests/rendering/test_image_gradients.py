@@ -20,12 +20,6 @@ from dolens.sensor.pixels import Sensor
 LINES = (656.2725, 587.5618, 486.1327)
 
 
-@pytest.fixture
-def backend():
-    """Lenses leave the choice open: fused renders, and the reference where it is asked for."""
-    return "auto"
-
-
 def triplet(root):
     return load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float64)
 

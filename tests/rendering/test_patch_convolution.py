@@ -18,6 +18,11 @@ from dolens.rendering.psf import splat
 from dolens.rendering.psf_renderer import uniform_image
 
 
+@pytest.fixture(params=[False, True], ids=["reference", "fused"])
+def fused(request):
+    return request.param
+
+
 def random(*shape, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -96,17 +101,17 @@ def plain_coordinates(planes, channels, height, width, top, left):
     return Coordinates(rows.double().expand(shape), columns.double().expand(shape))
 
 
-def test_looking_at_every_texel_in_turn_is_the_plain_convolution(backend):
+def test_looking_at_every_texel_in_turn_is_the_plain_convolution(fused):
     # The lookup's splines and the filter that undoes them cancel at whole texels.
     textures, kernels = random(1, 1, 2, 30, 30), random(4, 2, 2, 5, 5, seed=1)
-    layout = PatchLayout(patches(12, 10, 2, 2, textures), (12, 10), (7, 8), fused=backend == "cpu")
+    layout = PatchLayout(patches(12, 10, 2, 2, textures), (12, 10), (7, 8), fused=fused)
     plain = convolve_patches(textures, kernels, layout)
     coordinates = plain_coordinates(2, 2, 12, 10, 7, 8)
     looked = convolve_patches(textures, kernels, replace(layout, coordinates=coordinates))
     assert torch.allclose(looked, plain, atol=1e-6)
 
 
-def test_a_point_s_spline_is_looked_up_anywhere(backend):
+def test_a_point_s_spline_is_looked_up_anywhere(fused):
     # With a kernel of a point's spline at the centre the image is the texture, box-filtered:
     # Σ T[k]·β²(c - k), whatever fraction of a texel c lies at.
     textures = random(1, 1, 1, 40, 40)
@@ -115,7 +120,7 @@ def test_a_point_s_spline_is_looked_up_anywhere(backend):
     rows = 12.3 + 1.02 * torch.arange(10.0).double()[:, None].expand(10, 10)
     columns = 14.7 + 0.97 * torch.arange(10.0).double()[None].expand(10, 10)
     coordinates = Coordinates(rows[None, None], columns[None, None])
-    layout = PatchLayout(patch, (10, 10), (0, 0), coordinates, backend == "cpu")
+    layout = PatchLayout(patch, (10, 10), (0, 0), coordinates, fused)
     image = convolve_patches(textures, kernel[None, None, None], layout)[0, 0, 0]
 
     def spline(distance):
@@ -129,7 +134,7 @@ def test_a_point_s_spline_is_looked_up_anywhere(backend):
 
 @pytest.mark.parametrize("looked", [False, True])
 @pytest.mark.parametrize("shapes", [((1, 2), (2, 2)), ((1, 2), (1, 1)), ((2, 1), (2, 2))])
-def test_gradients_are_those_of_the_sum(looked, shapes, backend):
+def test_gradients_are_those_of_the_sum(looked, shapes, fused):
     textures = random(1, *shapes[0], 8, 7).requires_grad_()
     kernels = random(2, *shapes[1], 3, 3, seed=1).requires_grad_()
     coordinates = None
@@ -137,9 +142,7 @@ def test_gradients_are_those_of_the_sum(looked, shapes, backend):
         plain = plain_coordinates(2, 2, 4, 3, 4, 5)
         coordinates = Coordinates(1.01 * plain.rows + 0.2, 0.98 * plain.columns - 0.3)
 
-    layout = PatchLayout(
-        patches(4, 3, 1, 2, textures), (4, 3), (-2, 3), coordinates, backend == "cpu"
-    )
+    layout = PatchLayout(patches(4, 3, 1, 2, textures), (4, 3), (-2, 3), coordinates, fused)
 
     def image(textures, kernels):
         return convolve_patches(textures, kernels, layout)

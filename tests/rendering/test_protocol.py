@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import pytest
 import torch
 
 from dolens import load_lens
@@ -19,11 +18,6 @@ from dolens.sensor.readout import Readout
 LINES = (656.2725, 587.5618, 486.1327)
 WHOLE = Sensor(96, 120, 0.08)
 WINDOW = Sensor(16, 20, 0.08)
-
-
-@pytest.fixture
-def backend():
-    return "auto"
 
 
 @dataclass(frozen=True)

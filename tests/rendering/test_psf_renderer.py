@@ -27,12 +27,6 @@ LINES = (656.2725, 587.5618, 486.1327)
 GREY = 1.0 / 255.0
 
 
-@pytest.fixture
-def backend():
-    """The fused kernels: their equality with the reference is tested elsewhere."""
-    return "auto"
-
-
 def texture(size, smoothness=2.5):
     """Noise of a photograph's kind, smooth over a few texels, between 0 and 1."""
     generator = torch.Generator().manual_seed(3)
