@@ -34,6 +34,7 @@ from scripts.coding.cameras import (
     Bound,
     DepthCamera,
     Range,
+    Shot,
     best_of,
     refined,
     refocused,
@@ -68,15 +69,14 @@ FAMILIES = (
     "bracket of 5",
     "learned bracket of 3",
 )
-_READ_NOISE = 3.0  # electrons, as conf/readout/electrons.yaml has it
 
 
-def chosen(family: str, scene: Range, light: float, known: bool) -> tuple[DepthCamera, Bound]:
+def chosen(family: str, shot: Shot, known: bool) -> tuple[DepthCamera, Bound]:
     """Return a family's camera of least error by linear filters, and its errors."""
     equal = family.removeprefix("learned ")
-    camera, bound = best_of(equal, scene, light, _READ_NOISE, known)
+    camera, bound = best_of(equal, shot, known)
     if equal != family:
-        camera, bound = refined(camera, scene, light, _READ_NOISE, known)
+        camera, bound = refined(camera, shot, known)
     return camera, bound
 
 
@@ -88,33 +88,32 @@ def bounds(
     """
     found: dict[str, list[tuple[float, float]]] = {family: [] for family in families}
     for light in lights:
+        shot = Shot(scene, light)
         least = [
-            min(chosen(f"plain F/{n:g}", scene, light, known)[1][known] for n in F_NUMBERS)
+            min(chosen(f"plain F/{n:g}", shot, known)[1][known] for n in F_NUMBERS)
             for known in (False, True)
         ]
         for family in families:
-            own = [chosen(family, scene, light, known)[1][known] for known in (False, True)]
+            own = [chosen(family, shot, known)[1][known] for known in (False, True)]
             common, each = (10.0 * math.log10(a / b) for a, b in zip(least, own, strict=True))
             found[family].append((common, each))
     return found
 
 
 def best_on_validation(
-    cameras: Sequence[DepthCamera], scene: Range, light: float, restorer: str, validation: Tensor
+    cameras: Sequence[DepthCamera], shot: Shot, restorer: str, validation: Tensor
 ) -> DepthCamera:
     """Return the camera whose worst depth is best on validation photographs."""
     network = restorer_of(restorer)
 
     def score(camera: DepthCamera) -> float:
-        found = scores_of(camera, scene, light, _READ_NOISE, validation, network)
-        return float(found.mean(0).amin())
+        return float(scores_of(camera, shot, validation, network).mean(0).amin())
 
     return max(cameras, key=score)
 
 
 def judge(
-    scene: Range,
-    light: float,
+    shot: Shot,
     restorer: str,
     families: Sequence[str],
     photographs: tuple[Tensor, Tensor],
@@ -123,22 +122,22 @@ def judge(
     """Print a table's rows, and return gains at the worst depth with their intervals, by family."""
     validation, test = photographs
     network, known = restorer_of(restorer), restorer == "by depth"
-    stops = [chosen(f"plain F/{n:g}", scene, light, known)[0] for n in F_NUMBERS]
-    judges = (scene, light, restorer, validation)
+    stops = [chosen(f"plain F/{n:g}", shot, known)[0] for n in F_NUMBERS]
+    judges = (shot, restorer, validation)
     plain = best_on_validation(stops, *judges)
-    plain = best_on_validation(refocused(plain, scene), *judges)
-    reference = scores_of(plain, scene, light, _READ_NOISE, test, network)
-    _print_row(light, restorer, plain, reference)
+    plain = best_on_validation(refocused(plain, shot.scene), *judges)
+    reference = scores_of(plain, shot, test, network)
+    _print_row(shot.light, restorer, plain, reference)
     found = {}
     for family in families:
-        camera, _ = chosen(family, scene, light, known)
-        camera = best_on_validation(refocused(camera, scene), *judges)
+        camera, _ = chosen(family, shot, known)
+        camera = best_on_validation(refocused(camera, shot.scene), *judges)
         several = len(camera.foci) > 1 and not camera.one
         for motion in motions if several else (Motion(),):
-            scores = scores_of(camera, scene, light, _READ_NOISE, test, network, motion)
+            scores = scores_of(camera, shot, test, network, motion)
             gain = gain_at_worst(scores, reference)
             moving = f", motion {motion.pixels:g} {motion.knowledge}" if motion.pixels else ""
-            _print_row(light, restorer, camera, scores, reference, moving)
+            _print_row(shot.light, restorer, camera, scores, reference, moving)
             found[f"{family}{moving}"] = (gain.estimate, gain.low, gain.high)
     return found
 
@@ -152,17 +151,17 @@ def draw_scene(light: float, families: Sequence[str], folders: Sequence[Path], f
     if file is None:
         raise InputError("scene: --figure FILE is missing")
     name, scene = next(iter(RANGES.items()))
+    shot = Shot(scene, light)
     validation = scenes_of(folders, "val", MARGIN)
     photographs = scikit_image_scenes()[: len(scene.depths)]
     restorer = "by depth"
-    judges = (scene, light, restorer, validation)
-    stops = [chosen(f"plain F/{n:g}", scene, light, True)[0] for n in F_NUMBERS]
-    plain = best_on_validation(stops, *judges)
-    cameras = [plain, *(chosen(family, scene, light, True)[0] for family in families)]
+    stops = [chosen(f"plain F/{n:g}", shot, True)[0] for n in F_NUMBERS]
+    plain = best_on_validation(stops, shot, restorer, validation)
+    cameras = [plain, *(chosen(family, shot, True)[0] for family in families)]
     network = restorer_of(restorer)
     rows = {
         c.family if c is plain else f"{c.family}, F/{c.f_number:g}": scene_of(
-            c, scene, light, _READ_NOISE, photographs, network
+            c, shot, photographs, network
         )
         for c in cameras
     }
@@ -236,7 +235,8 @@ def main(arguments: Sequence[str]) -> int:
                 )
                 for light in given.lights:
                     for restorer in given.restorers:
-                        judged = judge(scene, light, restorer, given.families, photographs, motions)
+                        shot = Shot(scene, light)
+                        judged = judge(shot, restorer, given.families, photographs, motions)
                         for family, gain in judged.items():
                             points.setdefault(f"{family}, {restorer}", {})[light] = gain
             shown.append(GainRange(name, given.lights, found, points))

@@ -48,6 +48,20 @@ class Range:
     pitch: float = 0.0069
 
 
+class Shot(NamedTuple):
+    """What is photographed, and in how much light.
+
+    Attributes:
+        scene: depths and pixels.
+        light: electrons in white at F/8, of all readouts together.
+        read_noise: electrons, of each readout.
+    """
+
+    scene: Range
+    light: float
+    read_noise: float = 3.0  # as conf/readout/electrons.yaml has it
+
+
 @dataclass(frozen=True)
 class DepthCamera:
     """The achromatic doublet as a camera of one exposure time.
@@ -124,21 +138,21 @@ def _geometric(
     return with_diffraction_limit(found, scene.pitch, planes.wavelengths, n)[:, 0]
 
 
-def noise_of(camera: DepthCamera, light: float, read_noise: float) -> tuple[float, float]:
-    """Return the noise of a readout: a·x + b at light x; `light` is of white at F/8."""
-    electrons = light * (8.0 / camera.f_number) ** 2
+def noise_of(camera: DepthCamera, shot: Shot) -> tuple[float, float]:
+    """Return the noise of a readout: a·x + b at light x."""
+    electrons = shot.light * (8.0 / camera.f_number) ** 2
     if not camera.one:
         electrons /= len(camera.foci)
-    return 1.0 / electrons, (read_noise / electrons) ** 2
+    return 1.0 / electrons, (shot.read_noise / electrons) ** 2
 
 
 @torch.no_grad()
-def bound_of(camera: DepthCamera, scene: Range, light: float, read_noise: float) -> Bound:
+def bound_of(camera: DepthCamera, shot: Shot) -> Bound:
     """Return the least errors of linear filters."""
     plate = tuple(camera.plate.items())
-    each = torch.stack([_geometric(camera.f_number, plate, z, scene) for z in camera.foci])
-    shot, read = noise_of(camera, light, read_noise)
-    variance, count = _MEAN * shot + read, len(each)
+    each = torch.stack([_geometric(camera.f_number, plate, z, shot.scene) for z in camera.foci])
+    photons, read = noise_of(camera, shot)
+    variance, count = _MEAN * photons + read, len(each)
     if camera.one:
         each, count = each.mean(0, keepdim=True), 1
     spectrum = natural_spectrum(_SIDE, _SIDE, _VARIANCE, _OUTER_SCALE, torch.zeros(()))
@@ -171,21 +185,17 @@ def candidates(family: str, scene: Range) -> Iterator[DepthCamera]:
                     yield DepthCamera(family, stop, chosen, {}, family == "sweep")
 
 
-def best_of(
-    family: str, scene: Range, light: float, read_noise: float, known: bool
-) -> tuple[DepthCamera, Bound]:
+def best_of(family: str, shot: Shot, known: bool) -> tuple[DepthCamera, Bound]:
     """Return the camera of a family with the least error, of filters for each depth or for all."""
-    found = [(c, bound_of(c, scene, light, read_noise)) for c in candidates(family, scene)]
+    found = [(c, bound_of(c, shot)) for c in candidates(family, shot.scene)]
     return min(found, key=lambda pair: pair[1].each if known else pair[1].common)
 
 
-def refined(
-    camera: DepthCamera, scene: Range, light: float, read_noise: float, known: bool
-) -> tuple[DepthCamera, Bound]:
+def refined(camera: DepthCamera, shot: Shot, known: bool) -> tuple[DepthCamera, Bound]:
     """Return a camera whose foci are free, by steps of coordinates that halve, and its errors."""
 
     def error(foci: Sequence[float]) -> float:
-        found = bound_of(replace(camera, foci=tuple(foci)), scene, light, read_noise)
+        found = bound_of(replace(camera, foci=tuple(foci)), shot)
         return found.each if known else found.common
 
     foci, step = list(camera.foci), 0.08
@@ -200,7 +210,7 @@ def refined(
                     foci, least = trial, now
         step = step if least < before else step / 2.0
     found = replace(camera, family=f"learned {camera.family}", foci=tuple(foci))
-    return found, bound_of(found, scene, light, read_noise)
+    return found, bound_of(found, shot)
 
 
 def refocused(camera: DepthCamera, scene: Range) -> list[DepthCamera]:

@@ -17,7 +17,7 @@ from dolens.reconstruction.quality import Interval, gain_interval
 from dolens.reconstruction.wiener import shifted
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
-from scripts.coding.cameras import DepthCamera, Range, noise_of, wave_functions
+from scripts.coding.cameras import DepthCamera, Shot, noise_of, wave_functions
 from scripts.restoration_of_lenses import SIDE
 
 MARGIN = 64
@@ -69,10 +69,8 @@ class Images(NamedTuple):
 @torch.no_grad()
 def images_of(
     camera: DepthCamera,
-    scene: Range,
+    shot: Shot,
     depth: int,
-    light: float,
-    read_noise: float,
     scenes: Tensor,
     network: Restoration,
     motion: Motion | None = None,
@@ -82,20 +80,18 @@ def images_of(
 
     Args:
         camera: to be judged.
-        scene: its depths and pixels.
+        shot: depths, pixels and light.
         depth: number of the depth.
-        light: electrons in white at F/8, of all readouts together.
-        read_noise: electrons, of each readout.
         scenes: (P, 3, S, S).
         network: restores.
         motion: between readouts; None: none.
         functions: by waves, where they are known already.
     """
     motion = motion or Motion()
-    functions = wave_functions(camera, scene) if functions is None else functions
+    functions = wave_functions(camera, shot.scene) if functions is None else functions
     told = _cut(functions)
     count = len(told)
-    readout = _readout(camera, light, read_noise)
+    readout = _readout(camera, shot)
     noise = torch.tensor([readout.noise] * count)
     generator = torch.Generator().manual_seed(depth)
     truth, raws, found = linear_to_srgb(scenes[_INNER]), [], []
@@ -117,20 +113,16 @@ def images_of(
 @torch.no_grad()
 def scores_of(
     camera: DepthCamera,
-    scene: Range,
-    light: float,
-    read_noise: float,
+    shot: Shot,
     scenes: Tensor,
     network: Restoration,
     motion: Motion | None = None,
 ) -> Tensor:
     """Return PSNR (dB) by photograph and depth, (P, D)."""
-    functions = wave_functions(camera, scene)
+    functions = wave_functions(camera, shot.scene)
     columns = []
-    for depth in range(len(scene.depths)):
-        found = images_of(
-            camera, scene, depth, light, read_noise, scenes, network, motion, functions
-        )
+    for depth in range(len(shot.scene.depths)):
+        found = images_of(camera, shot, depth, scenes, network, motion, functions)
         columns.append(psnr_db(found.restored, found.truth))
     return torch.stack(columns, dim=1)
 
@@ -148,14 +140,7 @@ def gain_of_mean(camera: Tensor, other: Tensor) -> Interval:
 
 
 @torch.no_grad()
-def scene_of(
-    camera: DepthCamera,
-    scene: Range,
-    light: float,
-    read_noise: float,
-    photographs: Tensor,
-    network: Restoration,
-) -> Images:
+def scene_of(camera: DepthCamera, shot: Shot, photographs: Tensor, network: Restoration) -> Images:
     """Image photographs at rest side by side, each at a depth of its own, and restore them at once.
 
     Light of one that falls on its neighbour is left out.
@@ -164,8 +149,8 @@ def scene_of(
         camera: to be shown; the others as of `images_of`.
         photographs: one for each depth, (D, 3, S, S).
     """
-    told = _cut(wave_functions(camera, scene))
-    readout = _readout(camera, light, read_noise)
+    told = _cut(wave_functions(camera, shot.scene))
+    readout = _readout(camera, shot)
     still, generator = torch.zeros(len(told), 2), torch.Generator().manual_seed(0)
     parts = [
         _exposed(photograph, told[:, depth], still, readout, generator)
@@ -214,10 +199,10 @@ def _exposed(
     return torch.stack(images)[None]
 
 
-def _readout(camera: DepthCamera, light: float, read_noise: float) -> Readout:
-    shot, read = noise_of(camera, light, read_noise)
-    well = max(1.0 / shot, 8180.0)
-    return Readout.at_light(1.0 / shot, well, read_noise=math.sqrt(read) / shot / well)
+def _readout(camera: DepthCamera, shot: Shot) -> Readout:
+    photons, read = noise_of(camera, shot)
+    well = max(1.0 / photons, 8180.0)
+    return Readout.at_light(1.0 / photons, well, read_noise=math.sqrt(read) / photons / well)
 
 
 def _cut(functions: Tensor) -> Tensor:
