@@ -135,8 +135,10 @@ def note_if_empty(axes: Axes, values: np.ndarray, text: str) -> None:
 
 
 def _foci_handles() -> list[Line2D]:
-    ways = (("tangential", "-"), ("sagittal", "--"))
-    return [Line2D([], [], color="0.25", linewidth=1.4, linestyle=s, label=w) for w, s in ways]
+    return [
+        Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
+        Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
+    ]
 
 
 def _foci(axes: Axes, curves: FieldCurves, wavelengths: Iterable[int] | None = None) -> None:
