@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -35,12 +35,13 @@ class MovingAverage:
         self._sum = self._weight = 0.0
         self._last = math.nan
 
-    def add(self, number: float) -> None:
-        """Take a further number into account."""
+    def add(self, number: float, steps: int = 1) -> None:
+        """Take a further number into account, so many steps after the one before."""
         self._last = number
         if math.isfinite(number):
-            self._sum = self.smoothing * self._sum + number
-            self._weight = self.smoothing * self._weight + 1.0
+            share = self.smoothing**steps
+            self._sum = share * self._sum + number
+            self._weight = share * self._weight + 1.0
 
     @property
     def value(self) -> float:
@@ -118,8 +119,16 @@ _REFRESHES_PER_SECOND = 4
 _BAR_WIDTH = 30
 
 
-class Display(Protocol):
-    """Shows the progress of a run."""
+class Display:
+    """Shows the progress of a run; this one shows nothing.
+
+    Args:
+        snapshot: gives the present state.
+    """
+
+    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+        self.snapshot = snapshot
+        self._last = -math.inf
 
     def open(self) -> None:
         """Begin."""
@@ -128,7 +137,15 @@ class Display(Protocol):
         """Show the present state, if it is time; at once where something else has begun."""
 
     def close(self) -> None:
-        """End, and leave nothing behind."""
+        """End."""
+
+    def _is_time(self, seconds: float) -> bool:
+        """Return whether so many seconds have passed since this was true."""
+        now = time.monotonic()
+        if now - self._last < seconds:
+            return False
+        self._last = now
+        return True
 
 
 def display_for(snapshot: Callable[[], Snapshot], every_s: float) -> Display:
@@ -151,92 +168,63 @@ def display_for(snapshot: Callable[[], Snapshot], every_s: float) -> Display:
     return LogDisplay(snapshot, every_s)
 
 
-class LogDisplay:
-    """Writes a line of the log every so often, and one when some stage is entered first.
-
-    Args:
-        snapshot: gives the present state.
-        every_s: seconds between lines.
-    """
+class LogDisplay(Display):
+    """Writes a line of the log every so many seconds, and one when a stage is entered first."""
 
     def __init__(self, snapshot: Callable[[], Snapshot], every_s: float) -> None:
-        self.snapshot, self.every_s = snapshot, every_s
-        self._last = float("-inf")
+        super().__init__(snapshot)
+        self.every_s = every_s
         self._said: set[str] = set()
-
-    def open(self) -> None:
-        """Have a line after the first step."""
-        self._last = float("-inf")
 
     def update(self, force: bool = False) -> None:
         """Write a line if it is time, or if a stage is new."""
         now = self.snapshot()
         if now.stages:
-            self._say_once(f"{now.part}: {now.stage_text().partition(':')[0]}")
-        elif not force and now.done and time.monotonic() - self._last >= self.every_s:
-            self._last = time.monotonic()
+            line = f"{now.part}: {now.stage_text().partition(':')[0]}"
+            if line not in self._said:
+                self._said.add(line)
+                logger.info("%s", line)
+        elif not force and now.done and self._is_time(self.every_s):
             numbers = now.number_text()
             logger.info("%s: %s%s", now.part, now.headline(), f"; {numbers}" if numbers else "")
 
-    def _say_once(self, line: str) -> None:
-        if line not in self._said:
-            self._said.add(line)
-            logger.info("%s", line)
 
-    def close(self) -> None:
-        """There is nothing to be closed."""
+class NotebookDisplay(Display):
+    """Shows a text in the output of a notebook's cell, which changes a few times a second."""
 
-
-class NotebookDisplay:
-    """Shows a text in the output of a notebook's cell, which changes.
-
-    Args:
-        snapshot: gives the present state.
-    """
-
-    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
-        self.snapshot = snapshot
-        self._handle: Any = None
-        self._last = float("-inf")
+    _handle: Any = None
 
     def open(self) -> None:
         """Make the place of the text."""
         from IPython.display import display
 
-        self._handle = display(self._bundle("…"), raw=True, display_id=True)
+        self._handle = display({"text/plain": "…"}, raw=True, display_id=True)
 
     def update(self, force: bool = False) -> None:
-        """Change the text, a few times a second at most."""
-        if self._handle is None:
-            return
-        if force or time.monotonic() - self._last > 1.0 / _REFRESHES_PER_SECOND:
-            self._last = time.monotonic()
-            self._handle.update(self._bundle(plain_text(self.snapshot())), raw=True)
+        """Change the text."""
+        if self._handle is not None and (self._is_time(1.0 / _REFRESHES_PER_SECOND) or force):
+            self._handle.update({"text/plain": plain_text(self.snapshot())}, raw=True)
 
     def close(self) -> None:
         """Leave the last state as it is."""
         self.update(force=True)
         self._handle = None
 
-    def _bundle(self, text: str) -> dict[str, str]:
-        return {"text/plain": text}
 
-
-class TerminalDisplay:
+class TerminalDisplay(Display):
     """Shows a bar in the last lines of a terminal; lines of the log go above it.
 
-    Args:
-        snapshot: gives the present state.
-        console: of the terminal.
+    A thread draws it a few times a second.
     """
 
     def __init__(self, snapshot: Callable[[], Snapshot], console: Console) -> None:
-        self.snapshot, self.console = snapshot, console
+        super().__init__(snapshot)
+        self.console = console
         self._spinner = Spinner("dots")
         self._open = ExitStack()
 
     def open(self) -> None:
-        """Draw the bar, and again a few times a second from a thread of its own."""
+        """Draw the bar."""
         live = Live(
             console=self.console,
             get_renderable=self.renderable,
@@ -247,9 +235,6 @@ class TerminalDisplay:
         )
         self._open.enter_context(logging_above(self.console))
         self._open.enter_context(live)
-
-    def update(self, force: bool = False) -> None:
-        """Leave it to the thread."""
 
     def close(self) -> None:
         """Take the bar away."""

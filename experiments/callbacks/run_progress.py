@@ -60,16 +60,16 @@ class RunProgress(ProgressBar):
         self.smoothing, self.every_s = smoothing, every_s
         self._make = display or (lambda snapshot: display_for(snapshot, every_s))
         self._enabled = True
-        self._display: Display | None = None
-        self._listening = ExitStack()
-        self._part, self._detail = "fit", ""
-        self._done, self._total = 0, None
-        self._numbers: dict[str, float] = {}
-        self._averages: dict[str, MovingAverage] = {}
-        self._step_s, self._pause_s = MovingAverage(smoothing), MovingAverage(0.5)
+        self._display = Display(self.snapshot)
+        self._open = ExitStack()
+        self._now = _Part("fit", None)
+        self._training = self._now
+        self._numbers: dict[str, MovingAverage] = {}
+        self._step_s = MovingAverage(smoothing)
         self._stages: list[tuple[tuple[str, ...], float]] = []
         self._apart_s = 0.0  # of stages since the last step
-        self._mark = self._began = self._looked = time.monotonic()
+        self._mark = self._looked = time.monotonic()
+        self._unread = 0  # steps since the metrics were looked at
         self._names: Sequence[str] = ()
         self._seen = 0
 
@@ -88,70 +88,37 @@ class RunProgress(ProgressBar):
     ) -> None:
         """Open the display before the module and the data prepare themselves."""
         super().setup(trainer, pl_module, stage)
-        self._begin(stage, None)
-        if self._enabled and self._display is None:
+        self._now = _Part(stage, None)
+        if self._enabled and type(self._display) is Display:
             self._display = self._make(self.snapshot)
-            self._listening.enter_context(listening(self._hear))
+            self._open.enter_context(listening(self._hear))
+            self._open.callback(self._display.close)
             self._display.open()
 
-    def teardown(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str
-    ) -> None:
-        """Close the display."""
-        self._close()
+    def teardown(self, *arguments: Any, **options: Any) -> None:
+        """Close the display; where a run fails, so that the message is not overwritten."""
+        self._open.close()
+        self._display = Display(self.snapshot)
 
-    def on_exception(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        exception: BaseException,
-    ) -> None:
-        """Close the display, so that the message is not overwritten."""
-        self._close()
-
-    def _close(self) -> None:
-        self._listening.close()
-        if self._display is not None:
-            self._display.close()
-            self._display = None
+    on_exception = teardown
 
     # ---------------------------------------------------------------- the state
 
     def snapshot(self) -> Snapshot:
         """Return the present state."""
+        now, step_s = self._now, self._step_s.value
         names, since = self._stages[-1] if self._stages else ((), 0.0)
-        step_s = self._step_s.value
-        known = step_s == step_s and step_s > 0.0 and self._part == "fit"
         return Snapshot(
-            self._part,
-            self._done,
-            self._total,
-            self._detail,
-            dict(self._numbers),
-            1.0 / step_s if known else None,
-            self._remaining(step_s) if known else self._remaining_of_evaluation(),
+            now.name,
+            now.done,
+            now.total,
+            now.detail,
+            {name: average.value for name, average in self._numbers.items()},
+            1.0 / step_s if now.name == "fit" and step_s > 0.0 else None,
+            now.remaining_s(),
             names,
             time.monotonic() - since if names else 0.0,
         )
-
-    def _remaining(self, step_s: float) -> float | None:
-        """Seconds of the steps that are left, and of what is done between epochs."""
-        if self._total is None:
-            return None
-        left = max(self._total - self._done, 0)
-        per_epoch = self.trainer.num_training_batches
-        pauses = left / per_epoch * self._pause_s.value if per_epoch else 0.0
-        return left * step_s + (pauses if pauses == pauses else 0.0)
-
-    def _remaining_of_evaluation(self) -> float | None:
-        if self._part == "fit" or not self._done or self._total is None:
-            return None
-        return (time.monotonic() - self._began) / self._done * (self._total - self._done)
-
-    def _begin(self, part: str, total: float | None) -> None:
-        self._part, self._detail, self._done = part, "", 0
-        self._total = None if total is None or total == float("inf") else int(total)
-        self._began = time.monotonic()
 
     def _hear(self, event: StageEvent) -> None:
         if event.begins:
@@ -160,47 +127,37 @@ class RunProgress(ProgressBar):
             _, since = self._stages.pop()
             if not self._stages:
                 self._apart_s += time.monotonic() - since
-        self._update(force=True)
+        self._display.update(force=True)
 
-    def _update(self, force: bool = False) -> None:
-        if self._display is not None:
-            self._display.update(force)
-
-    def _read_numbers(self, steps: int) -> None:
+    def _read_numbers(self) -> None:
         """Take the metrics that are marked for a progress bar; smooth those of training."""
         for name, value in self.trainer.progress_bar_metrics.items():
-            average = self._averages.setdefault(name, MovingAverage(self.smoothing**steps))
-            average.smoothing = self.smoothing**steps if name.startswith("train/") else 0.0
-            average.add(float(value))
-            self._numbers[name] = average.value
+            smoothing = self.smoothing if name.startswith("train/") else 0.0
+            average = self._numbers.setdefault(name, MovingAverage(smoothing))
+            average.add(float(value), max(self._unread, 1))
+        self._looked, self._unread = time.monotonic(), 0
 
     # ---------------------------------------------------------------- training
 
     def on_train_start(self, trainer: lightning.Trainer, *arguments: Any) -> None:
         """Count all steps of the training, those before a resumed one as well."""
-        total = None
+        totals = [trainer.max_steps] if trainer.max_steps >= 0 else []
         if trainer.max_epochs is not None and trainer.max_epochs >= 0:
-            total = trainer.max_epochs * trainer.num_training_batches
-        if trainer.max_steps >= 0:
-            total = trainer.max_steps if total is None else min(total, trainer.max_steps)
-        self._begin("fit", total)
-        self._done = trainer.fit_loop.epoch_loop.total_batch_idx + 1
-        self._looked_at = self._done
-        self._mark, self._apart_s = time.monotonic(), 0.0
+            totals.append(trainer.max_epochs * trainer.num_training_batches)
+        done = trainer.fit_loop.epoch_loop.total_batch_idx + 1
+        self._now = _Part("fit", min(totals, default=None), done)
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, *arguments: Any) -> None:
         """Name the epoch."""
         last = trainer.max_epochs
         of = f" of {last}" if last is not None and last >= 0 else ""
-        self._detail = f"epoch {trainer.current_epoch + 1}{of}"
+        self._now.detail = f"epoch {trainer.current_epoch + 1}{of}"
 
     def on_train_batch_start(
         self, trainer: lightning.Trainer, module: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Close the pause between two epochs."""
+        """Leave what is done between two epochs out of the first step's time."""
         if batch_idx == 0:
-            if trainer.current_epoch > 0 and self._done:
-                self._pause_s.add(time.monotonic() - self._mark)
             self._mark, self._apart_s = time.monotonic(), 0.0
 
     def on_train_batch_end(self, *arguments: Any) -> None:
@@ -208,92 +165,101 @@ class RunProgress(ProgressBar):
         now = time.monotonic()
         self._step_s.add(max(now - self._mark - self._apart_s, 1e-9))
         self._mark, self._apart_s = now, 0.0
-        self._done += 1
+        self._unread += 1
+        self._now.count()
         if now - self._looked >= _LOOK_S:
-            self._looked = now
-            self._read_numbers(self._done - self._looked_at)
-            self._looked_at = self._done
-        self._update()
+            self._read_numbers()
+        self._display.update()
 
     def on_train_end(self, *arguments: Any) -> None:
         """Leave one line in the log, whatever the display."""
-        self._read_numbers(max(self._done - self._looked_at, 1))
+        self._read_numbers()
         if self._enabled:
-            took = clock_text(time.monotonic() - self._began)
+            took = clock_text(time.monotonic() - self._now.began)
             numbers = self.snapshot().number_text()
-            logger.info("fit: %d steps, %s; %s", self._done, took, numbers or "no numbers")
+            logger.info("fit: %d steps, %s; %s", self._now.done, took, numbers or "no numbers")
 
     # ---------------------------------------------------------------- validation and test
 
     def on_validation_start(self, trainer: lightning.Trainer, module: Any) -> None:
         """Show the validation for as long as it lasts."""
-        self._of_training = (self._done, self._total, self._detail, self._began)
-        self._begin("validate", _batches(trainer.num_val_batches))
-        self._look_up_photographs(trainer, "validation")
-
-    def on_validation_batch_start(
-        self, trainer: lightning.Trainer, module: Any, batch: Any, *arguments: Any
-    ) -> None:
-        """Name the photographs and views."""
-        self._describe(module, batch)
-
-    def on_validation_batch_end(self, *arguments: Any) -> None:
-        """Count the batch."""
-        self._done += 1
-        self._update()
-
-    def on_validation_end(self, trainer: lightning.Trainer, module: Any) -> None:
-        """Go back to the training."""
-        self._apart_s += time.monotonic() - self._began
-        self._part = "fit" if trainer.state.fn == "fit" else self._part
-        self._done, self._total, self._detail, self._began = self._of_training
+        self._training = self._now
+        self._evaluate(trainer, "validate", "validation", trainer.num_val_batches)
 
     def on_test_start(self, trainer: lightning.Trainer, module: Any) -> None:
         """Show the test."""
         self._numbers = {}
-        self._begin("test", _batches(trainer.num_test_batches))
-        self._look_up_photographs(trainer, "test")
+        self._evaluate(trainer, "test", "test", trainer.num_test_batches)
 
-    def on_test_batch_start(
+    def _evaluate(self, trainer: lightning.Trainer, part: str, split: str, batches: Any) -> None:
+        total = sum(batches) if isinstance(batches, list) else batches
+        self._now = _Part(part, None if total == float("inf") else int(total))
+        find = getattr(trainer.datamodule, "evaluation_photographs", None)
+        self._names, self._seen = [] if find is None else find(split), 0
+
+    def on_validation_batch_start(
         self, trainer: lightning.Trainer, module: Any, batch: Any, *arguments: Any
     ) -> None:
-        """Name the photographs and views."""
-        self._describe(module, batch)
-
-    def on_test_batch_end(self, *arguments: Any) -> None:
-        """Count the batch."""
-        self._done += 1
-        self._update()
-
-    def on_test_epoch_end(self, *arguments: Any) -> None:
-        """Leave the photographs: what follows is named by stages."""
-        self._detail = ""
-
-    def _look_up_photographs(self, trainer: lightning.Trainer, split: str) -> None:
-        find = getattr(trainer.datamodule, "evaluation_photographs", None)
-        self._names = [] if find is None else find(split)
-        self._seen = 0
-
-    def _describe(self, module: Any, batch: Any) -> None:
         """Name what a batch of crops shows, and how it is looked at."""
         if not self._names:
             return
-        names = list(
-            dict.fromkeys(map(shown_name, self._names[self._seen : self._seen + len(batch)]))
-        )
+        shown = self._names[self._seen : self._seen + len(batch)]
         self._seen += len(batch)
         labels = module.views.labels() if hasattr(module, "views") else []
-        pieces = [_listed("photograph", names), _listed("view", labels)]
-        self._detail = ", ".join(piece for piece in pieces if piece)
-        self._update()
+        pieces = [_listed("photograph", [*map(shown_name, shown)]), _listed("view", labels)]
+        self._now.detail = ", ".join(piece for piece in pieces if piece)
+        self._display.update()
+
+    def on_validation_batch_end(self, *arguments: Any) -> None:
+        """Count the batch."""
+        self._now.count()
+        self._display.update()
+
+    on_test_batch_start, on_test_batch_end = on_validation_batch_start, on_validation_batch_end
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: Any) -> None:
+        """Go back to the training."""
+        if trainer.state.fn == "fit":
+            self._apart_s += time.monotonic() - self._now.began
+            self._now = self._training
+
+    def on_test_epoch_end(self, *arguments: Any) -> None:
+        """Leave the photographs: what follows is named by stages."""
+        self._now.detail = ""
 
 
-def _batches(counts: Any) -> float:
-    return sum(counts) if isinstance(counts, list) else counts
+class _Part:
+    """A part of a run: how many of its steps are done, and where it is.
+
+    Args:
+        name: `fit`, `validate` or `test`.
+        total: steps in all; None: nobody knows.
+        done: before it began here, as of a run that is resumed.
+    """
+
+    def __init__(self, name: str, total: int | None, done: int = 0) -> None:
+        self.name, self.total, self.done, self.detail = name, total, done, ""
+        self.began = time.monotonic()
+        self._from: tuple[int, float] | None = None if name == "fit" else (done, self.began)
+
+    def count(self) -> None:
+        """Count a step."""
+        self.done += 1
+        if self._from is None:  # a first step may compile: time is counted from its end
+            self._from = (self.done, time.monotonic())
+
+    def remaining_s(self) -> float | None:
+        """Return the seconds that are left if they go on as so far, pauses included."""
+        done, since = self._from or (self.done, 0.0)
+        if self.total is None or self.done <= done:
+            return None
+        per_step = (time.monotonic() - since) / (self.done - done)
+        return per_step * max(self.total - self.done, 0)
 
 
 def _listed(what: str, names: Sequence[str]) -> str:
     """Return a few names, or how many there are."""
+    names = list(dict.fromkeys(names))
     if not names:
         return ""
     if len(names) > _NAMED:
