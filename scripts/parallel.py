@@ -104,7 +104,7 @@ def launchers(tiny: bool) -> dict[str, Measurement]:
     """A sweep of four designs of an asphere by every launcher, after one of them alone."""
     sweep = ("-m", *_JOB, _RADII.rpartition(",21.0")[0] if tiny else _RADII)
     found = {"one job alone": Measurement((*_JOB, "lens.surfaces.1.radius=20.8"), lambda _: "")}
-    for name in ("basic", "joblib", "submitit_local", "ray"):
+    for name in ("basic", "joblib", "ray"):
         found[name] = Measurement((*sweep, f"hydra/launcher={name}"), digest_of_metrics)
     return found
 

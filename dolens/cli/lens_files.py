@@ -1,7 +1,6 @@
 """The commands `dolens convert` and `dolens check`, about lens files of any format."""
 
 import os
-import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -68,19 +67,12 @@ def convert(
 def _write(data: bytes, path: Path) -> None:
     """Write a whole file or none."""
     from dolens.errors import InputError
+    from dolens.files import written_whole
 
-    name = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".dolens-", delete=False) as file:
-            name = file.name
-            file.write(data)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
+        with written_whole(path) as aside:
+            aside.write_bytes(data)
     except OSError as error:
-        if name is not None and os.path.exists(name):
-            os.unlink(name)
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 

@@ -5,7 +5,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,11 +14,9 @@ from typing import Any
 
 from hydra.core.utils import JobReturn
 
-from dolens.errors import InputError, one_line
-from dolens.experiments.running.process_settings import environment_variables
+from dolens.errors import InputError, check_choice, one_line
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.workers.ray_cluster import joined_cluster, local_cluster
-from dolens.threads import allowed_processors
 
 logger = logging.getLogger(__name__)
 
@@ -178,37 +176,10 @@ _LOOK_AT_SUBMISSIONS_S = 0.2
 _LINES = 2
 
 
-def in_local_submissions(
-    jobs: Sequence[SweepJob], folder: str, n_jobs: int = -1, timeout_min: int = 1440
-) -> Iterator[tuple[SweepJob, JobReturn]]:
-    """Run jobs on this machine as Slurm would: to try a sweep before it goes there.
-
-    Args:
-        jobs: to run.
-        folder: of submitit's files; `%j` in it stands for the number of a submission.
-        n_jobs: at once; -1: all cores.
-        timeout_min: minutes until a job is ended.
-
-    Raises:
-        InputError: submitit is not installed, or an option is not allowed.
-    """
-    if not jobs:
-        return
-    executor = _executor("local", folder, {"timeout_min": timeout_min})
-    share = share_of(jobs, n_jobs, allowed_processors())
-    waiting = deque(jobs)
-    running: list[tuple[SweepJob, Any]] = []
-    while waiting or running:
-        while waiting and len(running) < share.jobs:
-            job = waiting.popleft()
-            with environment_variables(share.environment()):
-                running.append((job, executor.submit(Elsewhere(job))))
-        yield from _ended(running)
-
-
 def in_slurm_jobs(
     jobs: Sequence[SweepJob],
     folder: str,
+    cluster: str = "slurm",
     array_parallelism: int = 256,
     max_num_timeout: int = 0,
     **parameters: Any,
@@ -218,6 +189,8 @@ def in_slurm_jobs(
     Args:
         jobs: to run.
         folder: of submitit's files, that all nodes see.
+        cluster: `slurm`, or `local`: all jobs at once on this machine, to try a sweep before it
+            goes to Slurm.
         array_parallelism: so many at once.
         max_num_timeout: so often a job that ran out of its time is queued again, to go on from its
             last checkpoint.
@@ -229,38 +202,32 @@ def in_slurm_jobs(
     """
     if not jobs:
         return
-    given = {name: value for name, value in parameters.items() if value is not None}
+    try:
+        import submitit
+    except ModuleNotFoundError:
+        raise InputError(
+            "hydra/launcher=submitit_slurm: the package 'submitit' is not installed; "
+            "pip install 'dolens[slurm]'"
+        ) from None
     common = ("timeout_min", "cpus_per_task", "gpus_per_node", "mem_gb", "nodes", "name")
-    executor = _executor(
-        "slurm",
-        folder,
-        {
-            **{name if name in common else f"slurm_{name}": v for name, v in given.items()},
-            "slurm_array_parallelism": array_parallelism,
-        },
-        slurm_max_num_timeout=max_num_timeout,
-    )
+    given = {
+        name if name in common else f"slurm_{name}": value
+        for name, value in parameters.items()
+        if value is not None
+    }
+    check_choice(cluster, ("slurm", "local"), "hydra.launcher.cluster")
+    try:
+        executor = submitit.AutoExecutor(
+            folder, cluster=cluster, slurm_max_num_timeout=max_num_timeout
+        )
+        executor.update_parameters(**given, slurm_array_parallelism=array_parallelism)
+    except (RuntimeError, NameError, TypeError, ValueError) as error:
+        raise InputError(f"hydra/launcher=submitit_slurm: {one_line(error)}") from None
     with executor.batch():
         submitted = [(job, executor.submit(Elsewhere(job))) for job in jobs]
     logger.info("%d jobs of Slurm: %s", len(jobs), ", ".join(one.job_id for _, one in submitted))
     while submitted:
         yield from _ended(submitted)
-
-
-def _executor(cluster: str, folder: str, parameters: Mapping[str, Any], **options: Any) -> Any:
-    launcher = f"hydra/launcher=submitit_{cluster}"
-    try:
-        import submitit
-    except ModuleNotFoundError:
-        raise InputError(
-            f"{launcher}: the package 'submitit' is not installed; pip install 'dolens[slurm]'"
-        ) from None
-    try:
-        executor = submitit.AutoExecutor(folder, cluster=cluster, **options)
-        executor.update_parameters(**parameters)
-    except (RuntimeError, NameError, TypeError, ValueError) as error:
-        raise InputError(f"{launcher}: {one_line(error)}") from None
-    return executor
 
 
 def _ended(running: list[tuple[SweepJob, Any]]) -> Iterator[tuple[SweepJob, JobReturn]]:

@@ -79,16 +79,6 @@ class JoblibLauncher(SweepLauncher):
         return in_processes
 
 
-class LocalSubmititLauncher(SweepLauncher):
-    """Runs jobs on this machine as if it were a Slurm cluster."""
-
-    def runner(self) -> Any:
-        """Return what runs the jobs."""
-        from dolens.experiments.sweeps.launchers import in_local_submissions
-
-        return in_local_submissions
-
-
 class SlurmLauncher(SweepLauncher):
     """Runs jobs on a Slurm cluster."""
 

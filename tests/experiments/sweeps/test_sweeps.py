@@ -32,17 +32,17 @@ def begun(folder: Path, job: int) -> list[str]:
 LAUNCHERS = {
     "basic": [],
     "joblib": ["hydra.launcher.n_jobs=2"],
-    "submitit_local": ["hydra.launcher.n_jobs=2", "hydra.launcher.timeout_min=5"],
+    "submitit_slurm": ["hydra.launcher.cluster=local", "hydra.launcher.timeout_min=5"],
     "ray": ["hydra.launcher.num_cpus=1"],
 }
 # What jobs do.  Hydra's own process would be gone; submitit repeats nothing by itself.
 ACTS = {
     "basic": ["finish", "fail", "finish"],
     "joblib": ["finish", "fail", "kill", "kill_once"],
-    "submitit_local": ["finish", "kill"],
+    "submitit_slurm": ["finish", "kill"],
     "ray": ["fail", "kill_once"],
 }
-PACKAGES = {"joblib": "joblib", "submitit_local": "submitit", "ray": "ray"}
+PACKAGES = {"joblib": "joblib", "submitit_slurm": "submitit", "ray": "ray"}
 
 
 @pytest.mark.parametrize("launcher", LAUNCHERS)
@@ -50,7 +50,7 @@ def test_a_failed_job_and_a_killed_one_leave_the_others(tmp_path, launcher, monk
     """Both are recorded where a comparison finds them; a killed one is repeated first."""
     if launcher in PACKAGES:
         pytest.importorskip(PACKAGES[launcher])
-    if launcher == "submitit_local":
+    if launcher == "submitit_slurm":
         # It waits for results that a slow network folder may hide for some seconds.
         monkeypatch.setattr("submitit.Job._results_timeout_s", 1)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
