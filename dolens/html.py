@@ -29,7 +29,7 @@ def element(tag: str, *children: Child, **attributes: str | None) -> Markup:
         attributes: escaped; `class_` is `class`, `data_x` is `data-x`; None is left out.
     """
     written = "".join(
-        f' {name.rstrip("_").replace("_", "-")}="{escape(_shown(value))}"'
+        f' {name.rstrip("_").replace("_", "-")}="{escape(shown(value))}"'
         for name, value in attributes.items()
         if value is not None
     )
@@ -37,7 +37,7 @@ def element(tag: str, *children: Child, **attributes: str | None) -> Markup:
     return Markup(f"<{tag}{written}>{joined(*children)}{end}")
 
 
-def _shown(text: str) -> str:
+def shown(text: str) -> str:
     """Return text without control characters, which no page may hold."""
     return _CONTROL.sub("�", text)
 
@@ -46,7 +46,7 @@ def joined(*children: Child) -> Markup:
     """Return markup and escaped text, one after another."""
     return Markup(
         "".join(
-            child if isinstance(child, Markup) else escape(_shown(child))
+            child if isinstance(child, Markup) else escape(shown(child))
             for child in children
             if child is not None
         )

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import dolens
 from dolens.experiments.report.checks import Material, Outcome, load_checks, outcomes
-from dolens.experiments.report.page.page import page
+from dolens.experiments.report.page import page
 from dolens.experiments.report.plan import Plan, System
 from dolens.experiments.report.runs import (
     RECORD,

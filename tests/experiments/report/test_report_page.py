@@ -8,14 +8,14 @@ import torch
 
 from dolens.errors import InputError
 from dolens.experiments.report.checks import Material, State, outcomes
-from dolens.experiments.report.page.overview import (
+from dolens.experiments.report.page import (
     gain_sentence,
     number_text,
+    page,
     seconds_text,
     step_text,
     value_text,
 )
-from dolens.experiments.report.page.page import page
 from dolens.experiments.report.prescriptions import load_golden_rays, trace_errors
 from dolens.experiments.report.runs import (
     assigned,

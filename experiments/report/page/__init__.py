@@ -1,1 +1,0 @@
-"""The report's page: pure functions from finished runs to HTML."""
