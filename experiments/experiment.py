@@ -39,10 +39,10 @@ class Experiment(lightning.LightningModule):
 
     Args:
         lens: the lens; its parameters get `requires_grad=False`.
-        experiment: the name of the experiment, as in `experiment=<name>`.
-        folder: the run folder, for tables; None: the experiment writes none.
 
     Attributes:
+        experiment: the name of the experiment, as in `experiment=<name>`; of a run.
+        folder: the run folder, for tables; None outside a run, where none are written.
         trains: whether there is anything to train; False makes `train=true` an error.
         metrics: names of the metrics that a run can have beside its costs; see `metric_names`.
         precisions: of a trainer, that `check_trainer` lets pass.
@@ -51,12 +51,21 @@ class Experiment(lightning.LightningModule):
     trains: bool = True
     metrics: ClassVar[tuple[str, ...] | None] = None
     precisions: ClassVar[tuple[str, ...]] = (EXACT,)
+    experiment: str = ""
+    folder: Path | None = None
 
-    def __init__(self, lens: Lens, experiment: str, folder: str | Path | None = None) -> None:
+    def __init__(self, lens: Lens) -> None:
         super().__init__()
         self.lens = lens.requires_grad_(False)
-        self.experiment = experiment
-        self.folder = None if folder is None else Path(folder)
+
+    def place(self, experiment: str, folder: Path | None) -> None:
+        """Say which run this is the work of; a run does so before anything else.
+
+        Args:
+            experiment: the name of the experiment.
+            folder: the run folder.
+        """
+        self.experiment, self.folder = experiment, folder
 
     def summary(self) -> dict[str, float]:
         """Return numbers about the whole run for metrics.json; called once, when it is done."""

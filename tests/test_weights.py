@@ -127,7 +127,7 @@ def of_tolerances(lens):
     # Every field and wavelength that the analysis names is the lens's own.
     spots = Spots(FIELDS, lens.wavelengths, PupilRays(2, 6))
     module = TolerancesModule(
-        *(lens, "", "", spots, None, {"surfaces.*.curvature": {"half_range": 1e-4}}, 1.0),
+        *(lens, spots, None, {"surfaces.*.curvature": {"half_range": 1e-4}}, 1.0),
         *(MonteCarlo(4, None, 0), ()),
     )
     # Drawn lenses vary with the seed alone.
@@ -358,7 +358,7 @@ def test_drawn_lenses_are_traced_by_the_spots_that_count(triplet):
     def analysed(fields, waves, weights):
         lens = weighted(triplet, WAVES, (0, 1, 0))
         module = TolerancesModule(
-            *(lens, "", "", Spots(fields, waves, PupilRays(2, 6)), weights),
+            *(lens, Spots(fields, waves, PupilRays(2, 6)), weights),
             *({"surfaces.*.curvature": {"half_range": 1e-4}}, 1.0),
             *(MonteCarlo(4, None, 0), [20.0]),
         )

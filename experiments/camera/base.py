@@ -28,7 +28,6 @@ class Camera(Experiment):
 
     Args:
         lens: the lens; its other parameters than the variables stay as they are.
-        experiment: name of the experiment.
         views: image the textures.
         network: restores the images; see `restoration_of`.
         loss: compares restored and true images; see `loss_terms`.
@@ -42,14 +41,13 @@ class Camera(Experiment):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
         views: Imaging,
         network: nn.Module,
         loss: Loss,
         variables: Mapping[str, Mapping[str, Any] | None],
         view_norm: float,
     ) -> None:
-        super().__init__(lens, experiment)
+        super().__init__(lens)
         self.variables = DesignVariables(lens, variables)
         self.variables.write_to(self.lens)
         self.network = restoration_of(network)

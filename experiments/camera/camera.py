@@ -89,7 +89,6 @@ class CameraModule(Camera):
 
     Args:
         lens: the lens; its other parameters stay as they are.
-        experiment: name of the experiment; a checkpoint of another one is refused.
         views: images the textures.
         reconstruction: restores the images, and judges what it restored.
         training: how the network and the lens's variables move.
@@ -110,7 +109,6 @@ class CameraModule(Camera):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
         views: Imaging,
         reconstruction: Reconstruction,
         training: Training,
@@ -127,7 +125,6 @@ class CameraModule(Camera):
                 raise InputError("exposures: given; allowed with tolerances: null")
         super().__init__(
             lens,
-            experiment,
             views,
             reconstruction.network,
             reconstruction.loss,

@@ -57,7 +57,6 @@ class DesignModule(Experiment):
 
     Args:
         lens: the lens; `start` moves it first.
-        experiment: name of the experiment; a checkpoint of another one is refused.
         variables: settings of `DesignVariables`.
         merit: the merit function.
         optimizer: parameter groups → optimizer; one that takes residuals, as `DampedLeastSquares`,
@@ -100,7 +99,6 @@ class DesignModule(Experiment):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
         variables: Mapping[str, Mapping[str, Any] | None] | None,
         merit: MeritSettings,
         optimizer: Callable[..., torch.optim.Optimizer],
@@ -113,7 +111,7 @@ class DesignModule(Experiment):
         mtf_max_frequency: float | None,
         keep_pupils: bool = False,
     ) -> None:
-        super().__init__(lens, experiment)
+        super().__init__(lens)
         self.automatic_optimization = False
         generator = torch.Generator().manual_seed(seed)
         values = start_values(lens, start or {}, generator)

@@ -81,8 +81,6 @@ class CamerasFromSearch(Analysis):
     compared with.
 
     Args:
-        experiment: name of the experiment.
-        folder: where all of it goes; cameras are run folders in `cameras/`.
         specification: of the search that is done first; nothing of it counts with `forms_from`.
         plan: of that search.
         forms: best forms that it writes.
@@ -106,8 +104,6 @@ class CamerasFromSearch(Analysis):
 
     def __init__(
         self,
-        experiment: str,
-        folder: str,
         specification: Specification,
         plan: SearchPlan,
         forms: int,
@@ -120,12 +116,12 @@ class CamerasFromSearch(Analysis):
             raise InputError("lens: cameras get the lenses of a search; allowed: null")
         search, found = None, ()
         if forms_from is None:
-            search = LensSearchModule(experiment, folder, specification, plan, forms, workers)
+            search = LensSearchModule(specification, plan, forms, workers)
             first = search.lens
         else:
             found = forms_of_run(forms_from, cameras.most)
             first = load_lens(found[0].file, dtype=torch.float64)
-        super().__init__(first, experiment, folder)
+        super().__init__(first)
         self.search, self.cameras = search, cameras
         self.workers = OwnThreads() if workers is None else workers_of(workers)
         self.forms: tuple[SearchedForm, ...] = found
@@ -136,6 +132,7 @@ class CamerasFromSearch(Analysis):
         assert self.folder is not None  # a run has one
         numbers: dict[str, float] = {}
         if self.search is not None:
+            self.search.place(self.experiment, self.folder)
             numbers |= self.search.analyse()
             self.forms = forms_of_run(self.folder, self.cameras.most)
         lenses = self.folder / "cameras" / "conf" / "lens"

@@ -48,7 +48,6 @@ class LensSearchModule(Analysis):
     """Searches for lenses, and checks and writes the best of each form.
 
     Args:
-        experiment: name of the experiment.
         folder: where tables and lenses go.
         specification: of the lens.
         plan: how much is searched.
@@ -78,8 +77,6 @@ class LensSearchModule(Analysis):
 
     def __init__(
         self,
-        experiment: str,
-        folder: str,
         specification: Specification,
         plan: SearchPlan,
         forms: int,
@@ -89,7 +86,7 @@ class LensSearchModule(Analysis):
         if lens is not None:
             raise InputError("lens: a search makes its own lens; allowed: null")
         check_count("forms", forms)
-        super().__init__(first_start(specification), experiment, folder)
+        super().__init__(first_start(specification))
         self.specification, self.plan, self.forms = specification, plan, forms
         self.workers = OwnThreads() if workers is None else workers_of(workers)
         self.finds = Finds(specification, plan)

@@ -54,8 +54,6 @@ class PoseAccuracyModule(Analysis):
 
     Args:
         lens: as designed; its elements may have poses.
-        experiment: name of the experiment.
-        folder: where tables go.
         bench: sources, wavelength and sensor.
         light: light and noise; its photons are those that errors by rays are compared with.
         truth: where the lens and the sources are, by name, degrees and mm.
@@ -81,8 +79,6 @@ class PoseAccuracyModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         bench: Bench,
         light: Light,
         truth: Mapping[str, float],
@@ -95,7 +91,7 @@ class PoseAccuracyModule(Analysis):
         seed: int = 0,
         workers: int | str | None = None,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         self.workers = workers_of(workers)
         for part in parts:
             check_choice(part, PARTS, "parts")

@@ -41,8 +41,6 @@ class PoseBoundsModule(Analysis):
 
     Args:
         lens: as designed; its elements may have poses.
-        experiment: name of the experiment.
-        folder: where tables go.
         bench: wavelength and sensor; arrangements have sources and planes of their own.
         light: light and noise; its photons are those of all images of an arrangement together.
         values: where the lens and the sources are, by name, degrees and mm.
@@ -73,8 +71,6 @@ class PoseBoundsModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         bench: Bench,
         light: Light,
         values: Mapping[str, float],
@@ -85,7 +81,7 @@ class PoseBoundsModule(Analysis):
         seed: int = 0,
         workers: int | str | None = None,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         self.workers = workers_of(workers)
         check_precision(lens, "known")
         if not variables or not arrangements:

@@ -64,8 +64,6 @@ class ChartPhotographsModule(Analysis):
 
     Args:
         lens: as designed; the fitted numbers are put into it.
-        experiment: name of the experiment.
-        folder: where tables go.
         chart: the marks.
         planes: where the sensor stands for each photograph, mm from `sensor_distance`.
         wavelengths: nm, of the chart's light.
@@ -100,8 +98,6 @@ class ChartPhotographsModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         chart: Chart,
         planes: Sequence[float],
         wavelengths: Sequence[float],
@@ -118,7 +114,7 @@ class ChartPhotographsModule(Analysis):
         restoration: Restoration,
         seed: int,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         check_precision(lens, "fitted")
         require_plane_sensor(lens.system(), "photographs of a chart")
         check_count("order", order, 2)

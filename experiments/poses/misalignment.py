@@ -59,8 +59,6 @@ class MisalignmentModule(Experiment):
 
     Args:
         lens: as designed; its elements may have poses.
-        experiment: name of the experiment; a checkpoint of another one is refused.
-        folder: of the run.
         bench: sources, sensor and planes; a photograph brings a sensor of its own.
         light: light and noise of simulated measurements.
         plan: the fits and their stages.
@@ -93,8 +91,6 @@ class MisalignmentModule(Experiment):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         bench: Bench,
         light: Light,
         plan: FitPlan,
@@ -103,7 +99,7 @@ class MisalignmentModule(Experiment):
         seed: int = 0,
         workers: int | str | None = None,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         self.workers = workers_of(workers)
         self.automatic_optimization = False
         check_precision(lens, "fitted")

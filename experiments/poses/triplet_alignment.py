@@ -149,8 +149,6 @@ class TripletAlignmentModule(Analysis):
 
     Args:
         lens: as designed; it has two elements or more with poses.
-        experiment: name of the experiment.
-        folder: where tables go.
         spots: their rays are fitted.
         photons: of each spot.
         simulation_pupil: the rays that are measured instead.
@@ -179,8 +177,6 @@ class TripletAlignmentModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         spots: Spots,
         photons: float,
         simulation_pupil: PupilRays,
@@ -188,7 +184,7 @@ class TripletAlignmentModule(Analysis):
         misalignments: Misalignments,
         iterations: int,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         self.elements = list(lens.elements)
         if len(self.elements) < 2:
             raise InputError("lens.elements: two or more are needed to tell one from another")

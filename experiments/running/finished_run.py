@@ -202,6 +202,7 @@ def _loaded(
         with torch.random.fork_rng(devices=()):
             module = _module(made_of, _lens(settings.prescription(), settings))
         check_experiment(module, train=False)
+        module.place(record.experiment, record.output)
     except (InputError, OmegaConfBaseException) as error:
         where = f"; Python looks for classes in {Path.cwd()} and in the folders of PYTHONPATH"
         message = f"{record.folder / RESOLVED}: {one_line(error)}"

@@ -100,6 +100,9 @@ def read_record(
     output = folder if output is None else resolved_path(output)
     job = job_of(folder)
     config = read_yaml(folder / RESOLVED) or {}
+    for key in ("experiment", "folder"):  # of run folders of old: an experiment is told by its run
+        if isinstance(config.get("module"), dict):
+            config["module"].pop(key, None)
     for path, value, _ in walk("", config):
         if isinstance(value, str) and "${" in value:
             raise InputError(f"{folder / RESOLVED}: {path} is '{value}', and not resolved")

@@ -81,6 +81,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     set_matmul_precision(settings.matmul_precision)
     module = build_module(settings)
     check_experiment(module, settings.train)
+    module.place(str(HydraConfig.get().runtime.choices.get("experiment")), folder)
     refuse_unknown(settings.objectives, module.metric_names(), names_of_targets(cfg, _LOGGING))
     checkpoint = settings.ckpt_path
     refuse_untrained(settings, module)

@@ -125,7 +125,6 @@ class SpeedVsErrorModule(Analysis):
 
     Args:
         lens: the lens of the run; it is not used.
-        experiment: name of the experiment.
         folder: where the table goes.
         scenes: name → settings of `subject_of`.
         parts: of `trace`, `psf` and `render`.
@@ -144,14 +143,12 @@ class SpeedVsErrorModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         scenes: Mapping[str, Mapping[str, Any]],
         parts: Sequence[str],
         contenders: Contenders,
         effort: Effort,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         for part in parts:
             check_choice(part, PARTS, "parts")
         self.parts = tuple(parts)

@@ -74,8 +74,6 @@ class TolerancesModule(Analysis):
 
     Args:
         lens: as designed; any elements with poses of their own are in its prescription.
-        experiment: name of the experiment.
-        folder: where tables go.
         spots: by which a lens is judged.
         weights: of the spots' fields; None: the lens's own where the fields are, else equal.  Those
             of wavelengths are the lens's own where they are, else equal.
@@ -108,8 +106,6 @@ class TolerancesModule(Analysis):
     def __init__(
         self,
         lens: Lens,
-        experiment: str,
-        folder: str,
         spots: Spots,
         weights: Sequence[float] | None,
         tolerances: Mapping[str, Any],
@@ -118,7 +114,7 @@ class TolerancesModule(Analysis):
         yield_at_um: Sequence[float],
         workers: int | str | None = None,
     ) -> None:
-        super().__init__(lens, experiment, folder)
+        super().__init__(lens)
         self.spots = spots
         self.weights = self._weights(weights)
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)

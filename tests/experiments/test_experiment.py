@@ -24,8 +24,6 @@ module:
   _target_: {target}
   _partial_: true
   _convert_: all
-  experiment: ${{hydra:runtime.choices.experiment}}
-  folder: ${{hydra:runtime.output_dir}}
   wavelengths: ${{wavelengths}}
 """
 
@@ -33,8 +31,8 @@ module:
 class FocalLengths(Analysis):
     """An analysis that a user might write: the focal length at each wavelength."""
 
-    def __init__(self, lens, experiment, folder, wavelengths):
-        super().__init__(lens, experiment, folder)
+    def __init__(self, lens, wavelengths):
+        super().__init__(lens)
         self.wavelengths = wavelengths
         self.rows = []
 
@@ -62,8 +60,8 @@ class FocalLengths(Analysis):
 class Power(Analysis):
     """The derivative of the lens's power with respect to a curvature."""
 
-    def __init__(self, lens, experiment, folder, wavelengths):
-        super().__init__(lens, experiment, folder)
+    def __init__(self, lens, wavelengths):
+        super().__init__(lens)
 
     def analyse(self):
         (curvature,) = self.lens.variables(["surfaces.1.curvature"]).values()
@@ -76,7 +74,7 @@ class Power(Analysis):
 class Bare(lightning.LightningModule):
     """A module without the contract."""
 
-    def __init__(self, lens, experiment, folder, wavelengths):
+    def __init__(self, lens, wavelengths):
         super().__init__()
         self.lens = lens
 
