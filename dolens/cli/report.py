@@ -160,7 +160,7 @@ def _list(plan: Any) -> None:
 def _summary(made: Any) -> bool:
     """Print what holds and what does not; return whether anything failed."""
     checks = import_extra(f"{_PACKAGE}.checks", "train", "dolens report")
-    overview = import_extra(f"{_PACKAGE}.page.overview", "train", "dolens report")
+    overview = import_extra(f"{_PACKAGE}.page", "train", "dolens report")
     counts = Counter(outcome.state for outcome in made.outcomes)
     for outcome in made.outcomes:
         if outcome.state is checks.State.FAILS:
@@ -181,5 +181,5 @@ def _summary(made: Any) -> bool:
 
 
 def _duration(seconds: float) -> str:
-    numbers = import_extra(f"{_PACKAGE}.page.overview", "train", "dolens report")
+    numbers = import_extra(f"{_PACKAGE}.page", "train", "dolens report")
     return numbers.seconds_text(seconds)
