@@ -10,7 +10,17 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from torch import Tensor
 
@@ -33,25 +43,43 @@ _WORDS: dict[Any, str] = {
 }
 
 
-def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
-    """Return the type hints of the parameters that a class or a function takes; none where they
-    cannot be found out.
+class Parameters(NamedTuple):
+    """What a class or a function takes.
+
+    Attributes:
+        hints: name → type hint; `Any` where there is none, or none that can be found out.
+        closed: whether it takes no other names.
+    """
+
+    hints: dict[str, Any]
+    closed: bool
+
+
+def parameters_of(make: Callable[..., Any]) -> Parameters:
+    """Return the parameters of a class or a function.
 
     What it takes as `**options` is for the classes that it derives from, or, where it is a class
     method, for its class.
     """
     call: Any = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
-        names = inspect.signature(call).parameters
+        parameters = inspect.signature(call).parameters.values()
+    except (TypeError, ValueError):  # of some classes that are written in C
+        return Parameters({}, False)
+    try:
         hints = get_type_hints(call)
     except Exception:  # hints of others' classes may name what is not installed
-        return {}
-    found: dict[str, Any] = {}
-    if any(one.kind is one.VAR_KEYWORD for one in names.values()):
-        own = getattr(make, "__self__", None)
-        for parent in (own,) if isinstance(own, type) else getattr(make, "__bases__", ()):
-            found |= hints_of(parent)
-    return found | {name: hint for name, hint in hints.items() if name in names}
+        hints = {}
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    own = {p.name: hints.get(p.name, Any) for p in parameters if p.kind in named}
+    own.pop("self", None)
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+        return Parameters(own, True)
+    of_method = getattr(make, "__self__", None)
+    bases = (of_method,) if isinstance(of_method, type) else getattr(make, "__bases__", ())
+    inherited = [parameters_of(base) for base in bases if base is not object]
+    merged = {name: hint for one in inherited for name, hint in one.hints.items()} | own
+    return Parameters(merged, bool(inherited) and all(one.closed for one in inherited))
 
 
 def check_type(value: object, hint: Any, where: str) -> None:
@@ -80,10 +108,9 @@ def check_types(make: Callable[..., Any], settings: Mapping[str, Any], where: st
     Raises:
         InputError: the first such value.
     """
-    hints = hints_of(make)
+    hints = parameters_of(make).hints
     for name, value in settings.items():
-        if name in hints:
-            check_type(value, hints[name], f"{where}.{name}")
+        check_type(value, hints.get(name, Any), f"{where}.{name}")
 
 
 def call_with_settings(
@@ -136,13 +163,17 @@ def _fits(value: object, hint: Any) -> bool:
         if isinstance(value, str) or not isinstance(value, Sequence):
             return False
         return _entries_fit(value, base, inner)
-    if base in (dict, Mapping):
+    if _is_mapping(base):
         if not isinstance(value, Mapping):
             return False
         return all(_fits(v, inner[1]) for v in value.values() if inner)
     if base is Tensor:
         return not isinstance(value, str | bool)
     return not (_is_made(base) and isinstance(value, str | int | float))
+
+
+def _is_mapping(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Mapping)
 
 
 def _is_made(hint: Any) -> bool:
@@ -173,7 +204,7 @@ def _allowed(hint: Any) -> str:
     if base in _LISTS:
         entries = [_allowed(one) for one in inner if one is not Ellipsis]
         return f"a list, each {' or '.join(dict.fromkeys(entries))}" if entries else "a list"
-    if base in (dict, Mapping):
+    if _is_mapping(base):
         return "a mapping"
     return _WORDS.get(base, getattr(base, "__name__", str(base)))
 

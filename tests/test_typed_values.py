@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.typed_values import check_type, hints_of
+from dolens.typed_values import check_type, parameters_of
 
 TAKEN = [
     (1, int), (1, float), (1.5, float), (math.inf, float), (True, bool), ("x", str), ("x", Path),
@@ -50,6 +50,8 @@ def test_what_a_hint_does_not_allow_is_refused_by_its_key(value, hint, said):
     assert str(error.value) == f"key: {said}"
 
 
-def test_hints_are_those_of_a_constructor():
-    assert hints_of(torch.optim.Adam)["maximize"] is bool
-    assert hints_of(len) == {}
+def test_parameters_are_those_of_a_constructor():
+    adam = parameters_of(torch.optim.Adam)
+    assert adam.hints["maximize"] is bool and adam.closed
+    assert "self" not in adam.hints
+    assert not parameters_of(dict).closed  # takes any name

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice, did_you_mean
 from dolens.experiments.settings import check_count
+from dolens.typed_values import check_type, parameters_of
 
 logger = logging.getLogger(__name__)
 
@@ -103,6 +104,11 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 # Of NumPy's generators.
 _SEEDS = 2**32
 _PRECISIONS = ("highest", "high", "medium")
+# Whose types are compared with the hints; others have checks of their own.
+_TYPED = (
+    *("module", "data", "trainer", "callbacks", "logger", "lens"),
+    *("train", "test", "seed", "ckpt_path", "state"),
+)
 
 
 @dataclass(frozen=True)
@@ -155,21 +161,13 @@ class RunSettings:
     state: str | None = None
 
     def __post_init__(self) -> None:
-        for key in ("module", "data", "trainer"):
-            _check_mapping(key, getattr(self, key))
-        for key in ("callbacks", "logger", "lens"):
-            if getattr(self, key) is not None:
-                _check_mapping(key, getattr(self, key))
+        hints = parameters_of(type(self)).hints
+        for key in _TYPED:
+            check_type(getattr(self, key), hints[key], key)
         check_choice(self.lens_dtype, DTYPES, "lens_dtype")
         check_choice(self.matmul_precision, _PRECISIONS, "matmul_precision")
-        for key in ("train", "test"):
-            _check_type(key, getattr(self, key), bool, "true or false")
-        _check_type("seed", self.seed, int, "an integer")
         if not 0 <= self.seed < _SEEDS:
             raise InputError(f"seed: {self.seed}; allowed: an integer from 0 to {_SEEDS - 1}")
-        for key in ("ckpt_path", "state"):
-            if getattr(self, key) is not None:
-                _check_type(key, getattr(self, key), str, "a text, or null")
         if self.threads is not None:
             check_count("threads", self.threads)
         check_trainer(self.trainer)
@@ -214,17 +212,6 @@ class RunSettings:
         if self.lens is None:
             raise InputError("lens: is missing from the configuration")
         return OmegaConf.to_container(self.lens, resolve=True)
-
-
-def _check_mapping(key: str, value: Any) -> None:
-    if not isinstance(value, DictConfig):
-        raise InputError(f"{key}: {value!r}; allowed: settings, as a mapping")
-
-
-def _check_type(key: str, value: Any, kind: type, allowed: str) -> None:
-    # A bool is an int to Python, and none to a user.
-    if type(value) is not kind:
-        raise InputError(f"{key}: {value!r}; allowed: {allowed}")
 
 
 # The least that each may be; -1 of some means all, or no end.

@@ -1,9 +1,8 @@
 """Keys and values beside a `_target_` are checked: no class takes them, or they are missing."""
 
-import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from dolens.errors import InputError, check_keys
 from dolens.experiments.running.run_files import walk
 from dolens.experiments.settings import check_count, check_not_negative, check_positive
-from dolens.typed_values import check_type, hints_of
+from dolens.typed_values import check_type, parameters_of
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
 # A value that is another part of the configuration as a whole, as `network: ${network}`.
@@ -49,9 +48,9 @@ def refuse_unknown_keys(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
             does not exist.
     """
     for target in targets(plain, parts):
-        allowed = arguments_of(located(target))
-        if allowed is not None:
-            check_keys(target.keys, allowed, target.path)
+        taken = parameters_of(located(target))
+        if taken.closed:
+            check_keys(target.keys, list(taken.hints), target.path)
 
 
 def refuse_targets_in_lenses(plain: Mapping[str, Any]) -> None:
@@ -146,27 +145,6 @@ def located(target: Target) -> Any:
         ) from None
 
 
-def arguments_of(make: Callable[..., Any]) -> list[str] | None:
-    """Return the names of the arguments that something takes; None where it takes any.
-
-    What a class takes as `**options` is taken to be for the classes that it derives from.
-    """
-    try:
-        call = make.__init__ if isinstance(make, type) else make
-        parameters = list(inspect.signature(call).parameters.values())
-    except (TypeError, ValueError):  # of some classes that are written in C
-        return None
-    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    found = [p.name for p in parameters if p.kind in named and p.name != "self"]
-    if any(p.kind is p.VAR_KEYWORD for p in parameters):
-        bases = [base for base in getattr(make, "__bases__", ()) if base is not object]
-        inherited = [arguments_of(base) for base in bases]
-        if not inherited or None in inherited:
-            return None
-        found += [name for names in inherited for name in names]
-    return list(dict.fromkeys(found))
-
-
 def value_at(plain: Any, path: str) -> Any:
     """Return the value at a path; None where there is nothing."""
     for key in path.split("."):
@@ -190,13 +168,11 @@ def refuse_wrong_types(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
     """
     for target in targets(plain, parts):
         make = located(target)
-        hints = hints_of(make)
+        hints = parameters_of(make).hints
         for key in target.keys:
-            if key not in hints:
-                continue
             path, value = _followed(plain, f"{target.path}.{key}", target.values[key])
             if not _is_open(value):
-                check_type(value, hints[key], path)
+                check_type(value, hints.get(key, Any), path)
         if isinstance(make, type) and issubclass(make, torch.optim.Optimizer):
             _try_optimizer(plain, target, make)
         if isinstance(make, type) and issubclass(make, torch.optim.lr_scheduler.LRScheduler):
