@@ -65,7 +65,6 @@ def table(
     kind: str | None = None,
     column_kinds: Mapping[int, str] | None = None,
     row_kinds: Mapping[int, str] | None = None,
-    named_cells: bool = False,
 ) -> Markup:
     """Return a table.
 
@@ -75,10 +74,8 @@ def table(
         kind: its class.
         column_kinds: number of a column → class of its cells.
         row_kinds: number of a row → its class.
-        named_cells: whether cells know their column as `data-column`, for narrow screens.
     """
     kinds = [(column_kinds or {}).get(at) for at in range(len(columns))]
-    names = [name if named_cells else None for name in columns]
     head = (
         element("th", name, scope="col", class_=own)
         for name, own in zip(columns, kinds, strict=True)
@@ -86,10 +83,7 @@ def table(
     body = (
         element(
             "tr",
-            *(
-                element("td", cell, data_column=name, class_=own)
-                for cell, name, own in zip(row, names, kinds, strict=True)
-            ),
+            *(element("td", cell, class_=own) for cell, own in zip(row, kinds, strict=True)),
             class_=(row_kinds or {}).get(at),
         )
         for at, row in enumerate(rows)
