@@ -18,7 +18,7 @@ class Drawn(Experiment):
     """Counts what is drawn."""
 
     def __init__(self, figures, training=()):
-        super().__init__(torch.nn.Identity(), "drawn")
+        super().__init__(torch.nn.Identity())
         self.after, self.during, self.count = tuple(figures), tuple(training), 0
 
     def figures(self):
@@ -109,7 +109,7 @@ def test_a_list_of_figures_that_fails_is_logged(trainer, tmp_path, caplog):
 
 
 def test_an_experiment_without_figures_has_none(trainer, tmp_path):
-    module = Experiment(torch.nn.Identity(), "bare")
+    module = Experiment(torch.nn.Identity())
     callback = SaveFigures(tmp_path / "figures")
     callback.on_validation_end(trainer, module)
     callback.on_test_end(trainer, module)
