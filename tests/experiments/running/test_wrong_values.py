@@ -50,7 +50,7 @@ WRONG = {
         "trainer.check_val_every_n_epoch: 0; allowed: an integer of 1 or more"
     ),
     "lens.sensor.distance=-5": "lens.sensor.distance: -5 mm; the sensor must stand behind",
-    "ckpt_path=true": "ckpt_path: True; allowed: a text, or null",
+    "ckpt_path=true": "ckpt_path: true; allowed: a text or null",
     "scheduler.T_max=0": "scheduler.T_max: 0; allowed: an integer of 1 or more",
     "optimizer.network.lr=abc": "optimizer.network.lr: 'abc'; allowed: a number",
     "optimizer.least_squares=abc": "optimizer.least_squares: 'abc'; allowed: a mapping",
