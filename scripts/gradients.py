@@ -24,6 +24,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from dolens.optics.lens import Lens
@@ -166,7 +167,7 @@ def _loss(module: torch.nn.Module) -> Loss:
 
     def loss(values: Mapping[str, Tensor], seed: int) -> Tensor:
         every = {**{n: p.detach() for n, p in module.variables().items()}, **values}
-        taken = module.views.take(module.lens.with_values(every), textures, "train", seed)
+        taken = module.views.take(module.lens.with_values(every), Shot(textures, "train", seed))
         functions = module.functions(every, taken, "train")
         restored = module.restore(taken, functions)
         terms = module.loss_over_views(restored, taken.truth.to(restored.dtype))

@@ -13,6 +13,7 @@ from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.photograph_scores import table_name
 from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.data.photographs import shown_name
 from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.experiments.tables import write_table
@@ -97,7 +98,7 @@ class ValidationPictures(lightning.Callback):
         if not any(chosen.values()):
             return
         with stage("pictures"), evaluating(pl_module.network):
-            taken, functions = pl_module.take(pl_module.variables(), batch, "val", number)
+            taken, functions = pl_module.take(pl_module.variables(), Shot(batch, "val", number))
             restored = pl_module.restore(taken, functions).clamp(0.0, 1.0).float().cpu()
         truth, raw = taken.truth.float().cpu(), linear_to_srgb(taken.raw).float().cpu()
         for crop, photograph in chosen.items():

@@ -15,7 +15,7 @@ from dolens.experiments.camera.reconstruction import (
     loss_over_views,
     restoration_of,
 )
-from dolens.experiments.camera.views.base import Comparison, Imaging, Views
+from dolens.experiments.camera.views.base import Comparison, Imaging, Shot, Views
 from dolens.experiments.experiment import Experiment
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
@@ -110,32 +110,18 @@ class Camera(Experiment):
         """
         return loss_over_views(self.loss, restored, truth, self.view_norm, shared)
 
-    def take(
-        self,
-        values: Mapping[str, Tensor],
-        batch: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> tuple[Views, Tensor | None]:
+    def take(self, values: Mapping[str, Tensor], shot: Shot) -> tuple[Views, Tensor | None]:
         """Image textures, and find point spread functions where the network asks for them.
 
         Both are computed in the lens's own precision, whatever the trainer's is.
 
         Args:
             values: the lens's variables.
-            batch: textures (B, 3, h, w), linear light.
-            stage: `train`, `val` or `test`.
-            index: of the batch; with the stage and the seed it decides all random numbers.
-            reference: the renderer that makes the images; None: the camera's own.
-            share: of a larger batch, whose random numbers these textures have their part of.
+            shot: the textures, and what decides the random numbers.
         """
         with self.exact():
-            images = (self.lens.with_values(values), batch, stage, index, reference)
-            # Views that know no shares are asked for none.
-            taken = self.views.take(*images) if share is None else self.views.take(*images, share)
-            return taken, self.functions(values, taken, stage)
+            taken = self.views.take(self.lens.with_values(values), shot)
+            return taken, self.functions(values, taken, shot.stage)
 
     def share_of_step(self, count: int, batch_idx: int) -> BatchShare | None:
         """Return which images of a step's batch these are: of all processes, and of all batches

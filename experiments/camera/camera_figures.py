@@ -12,7 +12,7 @@ from torch import Tensor
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import evaluating
-from dolens.experiments.camera.views.base import Views
+from dolens.experiments.camera.views.base import Shot, Views
 from dolens.experiments.experiment import Figures
 from dolens.optics.paraxial import first_order
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
@@ -59,7 +59,7 @@ def _images(
     """Draw truth, raw and restored images; the same stage shows the same ones again."""
     # In evaluation mode: the network is shown as it is measured, and its statistics stay.
     with evaluating(camera.network):
-        taken, functions = camera.take(camera.variables(), crops[stage], stage, 0)
+        taken, functions = camera.take(camera.variables(), Shot(crops[stage], stage, 0))
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)
         depths = _depths(camera, taken, functions)
     truth, raw, restored = (

@@ -19,7 +19,7 @@ from dolens.experiments.camera.photograph_scores import (
     scores_by_photograph,
     statistics_of,
 )
-from dolens.experiments.camera.views.base import Views, seed_of
+from dolens.experiments.camera.views.base import Shot, Views, seed_of
 from dolens.reconstruction import (
     WienerBM3DRestoration,
     WienerTVRestoration,
@@ -59,9 +59,9 @@ class Evaluation:
         """Image, restore and compare textures (B, 3, h, w); see `Imaging.take` for the others."""
         values = camera.variables()
         for reference in (None, *camera.views.reference_renderers()):
-            started = time.perf_counter()
+            started, shot = time.perf_counter(), Shot(batch, stage, index, reference)
             with named_stage(f"judge {reference}") if reference else nullcontext():
-                taken, functions = camera.take(values, batch, stage, index, reference)
+                taken, functions = camera.take(values, shot)
             if reference is not None:
                 self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
             name = stage if reference is None else f"{stage}_{reference}"
@@ -70,7 +70,7 @@ class Evaluation:
             if filtered is not None:
                 row["linear_psnr_db"] = _compared(psnr_db, filtered.clamp(0.0, 1.0), taken.truth)
             if stage == "test":
-                row |= _of_plain_exposure(camera, values, batch, index, reference)
+                row |= _of_plain_exposure(camera, values, shot)
             if stage == "test" and reference is None:
                 row |= _of_rivals(camera, taken, functions, values)
             self._add(name, index, row)
@@ -212,16 +212,12 @@ def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
 
 
 def _of_plain_exposure(
-    camera: Camera,
-    values: Mapping[str, Tensor],
-    batch: Tensor,
-    index: int,
-    reference: str | None,
+    camera: Camera, values: Mapping[str, Tensor], shot: Shot
 ) -> dict[str, Tensor]:
     """Return scores (B, V) of what the network restores of a plain lens's images, if any."""
     with camera.exact():
         lens = camera.lens.with_values(values)
-        found = camera.views.plain_exposure(lens, batch, "test", index, reference)
+        found = camera.views.plain_exposure(lens, shot)
     if found is None:
         return {}
     taken, functions, noise = found

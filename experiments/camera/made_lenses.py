@@ -14,7 +14,7 @@ from dolens.errors import InputError
 from dolens.experiments.camera.as_built import MadeLens, Manufacture
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import evaluating
-from dolens.experiments.camera.views.base import Views
+from dolens.experiments.camera.views.base import Shot, Views
 from dolens.experiments.tables import Row
 from dolens.plotting.tolerances import made_lenses_figure
 from dolens.reconstruction import psnr_db
@@ -43,7 +43,7 @@ def training_images(
     """
     step = camera.global_step
     if manufacture is None or not manufacture.in_training:
-        taken, functions = camera.take(values, batch, "train", step, share=share)
+        taken, functions = camera.take(values, Shot(batch, "train", step, share=share))
         return taken, [functions]
     with camera.exact():
         lenses = manufacture.for_step(camera.lens.with_values(values), step)
@@ -82,11 +82,8 @@ def images_of_made_lenses(
     for number, made in enumerate(lenses):
         part = batch[number * size : (number + 1) * size]
         own = BatchShare(whole.first + number * size, whole.total)
-        alone = own.total == len(part)
-        lens = camera.lens.with_values(made.values)
-        arguments = (lens, part, "train", camera.global_step, None)
-        # Views that know no shares are asked for none.
-        taken.append(camera.views.take(*arguments) if alone else camera.views.take(*arguments, own))
+        shot = Shot(part, "train", camera.global_step, None, own if own.total > size else None)
+        taken.append(camera.views.take(camera.lens.with_values(made.values), shot))
         if functions and manufacture.gives_the_design_s_functions and not camera.knows_places:
             functions.append(functions[0])
             continue
@@ -280,7 +277,7 @@ def made_lens_scores(
     started = time.perf_counter()
 
     def taken_by(values: Mapping[str, Tensor]) -> Views:
-        return judging.take(camera.lens.with_values(values), crops, "test", 0)
+        return judging.take(camera.lens.with_values(values), Shot(crops, "test", 0))
 
     def scores(taken: Views, functions: Tensor | None) -> Tensor:
         restored = camera.restore(taken, functions).clamp(0.0, 1.0)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.camera.camera import CameraModule
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.lens_search.rungs import (
     Halving,
@@ -370,7 +371,7 @@ def _images(label: str, camera: RungOfForm) -> tuple[tuple[Tensor, Tensor, Tenso
     assert isinstance(module, CameraModule)  # it has a score
     run.data.setup("test")
     crop = next(iter(run.data.test_dataloader()))[:1]
-    taken, functions = module.take(module.variables(), crop, "test", 0)
+    taken, functions = module.take(module.variables(), Shot(crop, "test", 0))
     restored = module.restore(taken, functions).clamp(0.0, 1.0)
     labels = [name for name in module.views.labels() if name != "field"]
     chosen = sorted({0, len(labels) - 1})[:_SHOWN]

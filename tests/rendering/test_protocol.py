@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from dolens import load_lens
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.camera.views.fields import FieldViews
 from dolens.rendering.exit_pupil import ExitPupil
 from dolens.rendering.protocol import Renderer, SensorWindow
@@ -66,9 +67,9 @@ def test_a_large_field_is_seen_through_it(root):
     scene = PlanarScene((1e5,), LINES)
     views = FieldViews(scene, WHOLE, PinholeRenderer(WINDOW), Readout(), truth="pinhole")
     views.prepare(lens)
-    taken = views.take(lens, textures(), "test", 0)
+    taken = views.take(lens, Shot(textures(), "test", 0))
     assert torch.allclose(taken.raw, srgb_to_linear(taken.truth), atol=1e-6)
-    assert views.take(lens, textures(), "train", 0).raw.shape == (2, 1, 3, 16, 20)
+    assert views.take(lens, Shot(textures(), "train", 0)).raw.shape == (2, 1, 3, 16, 20)
     assert views.rays() == 0
 
 

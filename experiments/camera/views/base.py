@@ -25,6 +25,29 @@ _STAGES = {"train": 0, "val": 1, "test": 2}
 _STRIDE, _NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
 
 
+class Shot(NamedTuple):
+    """Textures in front of a camera, and what decides all random numbers of their images.
+
+    Attributes:
+        textures: (B, 3, h, w), linear light.
+        stage: `train`, `val` or `test`.
+        index: of the batch in its stage.
+        reference: the judge that makes the images, one of `Imaging.reference_renderers`, with the
+            same noise; None: the camera's own renderer.
+        share: of a larger batch, whose random numbers these textures have their part of.
+    """
+
+    textures: Tensor
+    stage: str
+    index: int
+    reference: str | None = None
+    share: BatchShare | None = None
+
+    def seed(self, seed: int) -> int:
+        """Return a seed of its own, of a run's; see `seed_of`."""
+        return seed_of(seed, self.stage, self.index)
+
+
 class Views(NamedTuple):
     """B textures, each imaged in V ways.
 
@@ -150,21 +173,8 @@ class Imaging(ABC):
         """Names of the point spread functions."""
 
     @abstractmethod
-    def take(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> Views:
-        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
-
-        With a judge, one of `reference_renderers`, it makes the images; the noise is the same.
-        Where the textures are a share of a batch, their random numbers are those that they have in
-        the whole batch.
-        """
+    def take(self, lens: Lens, shot: Shot) -> Views:
+        """Image the textures of a shot."""
 
     @abstractmethod
     def point_spread_functions(
@@ -303,14 +313,7 @@ class Imaging(ABC):
         generator = generator_of(seed + _NOISE_OFFSET, image.device)
         return readout.develop(readout(image, generator, share))
 
-    def plain_exposure(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-    ) -> PlainExposure | None:
+    def plain_exposure(self, lens: Lens, shot: Shot) -> PlainExposure | None:
         """Return images by a plain lens in one exposure, to compare; None where there is none."""
         return None
 

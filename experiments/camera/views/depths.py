@@ -10,7 +10,13 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.experiments.camera.views.base import SCENE_OFFSET, Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.base import (
+    SCENE_OFFSET,
+    Comparison,
+    Imaging,
+    Shot,
+    Views,
+)
 from dolens.experiments.camera.views.truth import (
     check_truth,
     reference_chief_ray_map,
@@ -34,7 +40,7 @@ from dolens.scene.layered import LayeredScene
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene, resized
 from dolens.sensor.colour import linear_to_srgb
-from dolens.sensor.noise import BatchShare, generator_of
+from dolens.sensor.noise import generator_of
 from dolens.sensor.readout import Readout
 
 
@@ -152,22 +158,15 @@ class DepthViews(Imaging):
         found = GradientMeasure(comparison.variables, comparison.values, loss)
         return lambda windows: found
 
-    def take(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> Views:
+    def take(self, lens: Lens, shot: Shot) -> Views:
         """Image textures at every depth."""
-        renderer = self._training if stage == "train" else self.evaluation_renderer
-        renderer = renderer if reference is None else self._reference_renderers[reference]
-        seed = seed_of(self.seed, stage, index)
-        image = renderer.render(lens, self.scene, textures, seed)
-        raw = self._raw(image, seed, share)
-        return Views(self._truth(lens, textures).expand_as(raw), raw)
+        renderer = self._training if shot.stage == "train" else self.evaluation_renderer
+        if shot.reference is not None:
+            renderer = self._reference_renderers[shot.reference]
+        seed = shot.seed(self.seed)
+        image = renderer.render(lens, self.scene, shot.textures, seed)
+        raw = self._raw(image, seed, shot.share)
+        return Views(self._truth(lens, shot.textures).expand_as(raw), raw)
 
     def _truth(self, lens: Lens, textures: Tensor) -> Tensor:
         """(B, D or 1, 3, H, W), display-encoded."""
@@ -270,22 +269,15 @@ class LayerViews(DepthViews):
             raise InputError("views: layers need a scene of layers; choose scene=layers")
         self.occluders = occluders
 
-    def take(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> Views:
+    def take(self, lens: Lens, shot: Shot) -> Views:
         """One image of each texture."""
+        textures = shot.textures
         if textures.shape[1] == len(self.scene.wavelengths):
-            generator = generator_of(seed_of(self.seed, stage, index) + SCENE_OFFSET)
+            generator = generator_of(shot.seed(self.seed) + SCENE_OFFSET)
             near, far = self.scene.depths[0], self.scene.depths[-1]
-            before = 0 if share is None else share.first
+            before = 0 if shot.share is None else shot.share.first
             textures = with_occluders(textures, near, far, self.occluders, generator, before)
-        return super().take(lens, textures, stage, index, reference, share)
+        return super().take(lens, shot._replace(textures=textures))
 
 
 def with_occluders(

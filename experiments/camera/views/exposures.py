@@ -15,8 +15,8 @@ from dolens.experiments.camera.views.base import (
     Comparison,
     Imaging,
     PlainExposure,
+    Shot,
     Views,
-    seed_of,
 )
 from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.experiments.settings import check_positive
@@ -24,7 +24,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
 from dolens.reconstruction.likelihood import estimated_motion
 from dolens.reconstruction.wiener import shifted
-from dolens.sensor.noise import BatchShare, generator_of
+from dolens.sensor.noise import generator_of
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
@@ -170,25 +170,16 @@ class ExposedViews(Imaging):
     def _readout(self, share: float) -> Readout:
         return replace(self.readout, exposure=share * self.readout.exposure)
 
-    def take(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> Views:
+    def take(self, lens: Lens, shot: Shot) -> Views:
         """Image textures in every state; see `Imaging.take`."""
-        motion = self._motion(stage, index).to(textures)
-        told = (reference,) if share is None else (reference, share)
+        seed, share = shot.seed(self.seed), shot.share
+        motion = self._motion(seed).to(shot.textures)
         found = []
         for moved, (part, there) in zip(motion, self._states(lens), strict=True):
-            shown = shifted(textures, moved) if bool(moved.any()) else textures
-            found.append(part.take(there, shown, stage, index, *told))
+            shown = shifted(shot.textures, moved) if bool(moved.any()) else shot.textures
+            found.append(part.take(there, shot._replace(textures=shown)))
         middle = found[len(found) // 2]  # which does not move
         shares = list(self.shares.values())
-        seed = seed_of(self.seed, stage, index)
         if not self._several:
             light = sum(s * one.raw for s, one in zip(shares, found, strict=True))
             assert isinstance(light, Tensor)  # there are two states at least
@@ -203,10 +194,9 @@ class ExposedViews(Imaging):
         mean = torch.einsum("n,bvnchw->bvchw", weights / weights.sum(), each)
         return Views(middle.truth, mean, middle.field, each, motion)
 
-    def _motion(self, stage: str, index: int) -> Tensor:
+    def _motion(self, seed: int) -> Tensor:
         """Return where the scene is at each readout, pixels down and to the right, (N, 2)."""
-        seed = seed_of(self.seed, stage, index) + _MOTION_OFFSET
-        angle = 2.0 * math.pi * torch.rand((), generator=generator_of(seed))
+        angle = 2.0 * math.pi * torch.rand((), generator=generator_of(seed + _MOTION_OFFSET))
         direction = torch.stack([angle.sin(), angle.cos()])
         count = len(self.shares)
         steps = torch.arange(count) - count // 2
@@ -274,19 +264,12 @@ class ExposedViews(Imaging):
         """Whether there is a plain lens to compare with."""
         return self.settings.beside is not None and not self.view_is_known
 
-    def plain_exposure(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-    ) -> PlainExposure | None:
+    def plain_exposure(self, lens: Lens, shot: Shot) -> PlainExposure | None:
         """Return images of the scene at rest by the state `beside`."""
         if not self.has_plain_exposure:
             return None
         there = lens.in_state(self.settings.beside)
-        taken = self._plain.take(there, textures, stage, index, reference)
+        taken = self._plain.take(there, shot._replace(share=None))
         functions = self._plain.point_spread_functions(there)
         return PlainExposure(taken, functions, self._plain.readout.noise)
 

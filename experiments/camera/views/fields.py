@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
-from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.base import Comparison, Imaging, Shot, Views, seed_of
 from dolens.experiments.camera.views.field_windows import (
     FieldWindows,
     field_functions,
@@ -170,17 +170,10 @@ class FieldViews(Imaging):
 
         return of_windows
 
-    def take(
-        self,
-        lens: Lens,
-        textures: Tensor,
-        stage: str,
-        index: int,
-        reference: str | None = None,
-        share: BatchShare | None = None,
-    ) -> Views:
+    def take(self, lens: Lens, shot: Shot) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
-        seed, count = seed_of(self.seed, stage, index), len(textures)
+        textures, stage, index, _, share = shot
+        seed, count = shot.seed(self.seed), len(textures)
         share = share or BatchShare(0, count)
         everywhere = [self._shown(stage, index * share.total + i) for i in range(share.total)]
         rows = everywhere[share.first : share.first + count]

@@ -12,6 +12,7 @@ from dolens.experiments.camera.made_lenses import (
     images_of_made_lenses,
     spread_over_photographs,
 )
+from dolens.experiments.camera.views.base import Shot
 from dolens.rendering.psf import axial_point_spread_functions
 from tests.experiments.tiny_experiment import CAMERA, ONE_EPOCH
 
@@ -76,7 +77,7 @@ def test_crops_are_of_as_many_photographs_as_there_are():
 def test_lenses_without_errors_image_as_the_lens_that_is_drawn(camera):
     module = camera("as_built.factor=1e-9", "as_built.lenses_per_step=2")
     design, batch = module.variables(), textures()
-    drawn, functions = module.take(design, batch, "train", 0)
+    drawn, functions = module.take(design, Shot(batch, "train", 0))
     made = module.manufacture.for_step(module.lens.with_values(design), 0)
     assert len(made) == 2
     taken, own = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
@@ -285,7 +286,7 @@ def test_other_cameras_are_made_with_errors_of_index_and_shape(made, experiment,
     design, batch = module.variables(), textures(1, 64 + 64)
     made = module.manufacture.for_step(module.lens.with_values(design), 0)
     taken, _ = images_of_made_lenses(module, module.manufacture, made, design, batch, None)
-    drawn, _ = module.take(design, batch, "train", 0)
+    drawn, _ = module.take(design, Shot(batch, "train", 0))
     difference = (taken.raw - drawn.raw).detach().abs().max()
     assert 1e-4 < difference < 1.0
     (slope,) = torch.autograd.grad(taken.raw.square().mean(), module.variables.scaled)

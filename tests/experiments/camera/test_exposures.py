@@ -8,6 +8,7 @@ from hydra.errors import InstantiationException
 
 from dolens.errors import InputError
 from dolens.experiments.camera.network_export import exportable
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.pictures import write_picture
@@ -56,7 +57,7 @@ def texture(count=1, seed=0):
 
 def taken(module, textures, stage="test"):
     with torch.no_grad():
-        return module.take(module.variables(), textures, stage, 0)
+        return module.take(module.variables(), Shot(textures, stage, 0))
 
 
 def test_each_readout_is_the_image_of_the_lens_in_its_state(camera):
@@ -160,7 +161,7 @@ def test_foci_have_the_gradient_of_the_loss(camera):
     batch, scaled = texture(), module.variables.scaled
 
     def value():
-        found, functions = module.take(module.variables(), batch, "train", 0)
+        found, functions = module.take(module.variables(), Shot(batch, "train", 0))
         return (module.restore(found, functions) - found.truth).square().mean()
 
     (slope,) = torch.autograd.grad(value(), scaled)
@@ -211,7 +212,7 @@ def test_a_bracket_is_applied_to_whole_pictures_at_rest(root, tmp_path):
 
 def test_the_plain_lens_beside_has_all_the_light_that_its_stop_passes(camera):
     module = camera("light=1000")
-    arguments = (module.lens.with_values(module.variables()), texture(), "test", 0)
+    arguments = (module.lens.with_values(module.variables()), Shot(texture(), "test", 0))
     with torch.no_grad():
         found = module.views.plain_exposure(*arguments)
     # At F/16 a quarter of F/8's, and all the time: 4/3 of the share's noise of a third.
@@ -269,7 +270,7 @@ def test_a_camera_of_a_field_tells_each_readout_s_function_of_each_place(made):
         "++variables={states.*.sensor_distance: {scale: 0.05}}",
     )
     textures = torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(0))
-    found, functions = module.take(module.variables(), textures, "train", 0)
+    found, functions = module.take(module.variables(), Shot(textures, "train", 0))
     views = found.raw.shape[1]
     assert found.readouts.shape == (2, views, 2, 3, 32, 32)
     assert functions.shape[:3] == (2 * views, 2, 1)

@@ -8,6 +8,7 @@ import torch
 from dolens.experiments.camera.as_built import AsBuilt, Manufacture
 from dolens.experiments.camera.evaluation import restored_by_rivals
 from dolens.experiments.camera.made_lenses import images_of_made_lenses
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.camera.views.field_windows import field_functions
 from dolens.experiments.camera.views.fields import FieldViews
 from dolens.experiments.commands.apply import apply_run
@@ -82,7 +83,7 @@ def test_an_image_is_its_truth_convolved_with_the_function_of_its_place(
     A pinhole's truth lacks the distortion, of which the function has the shift of the middle only.
     """
     lens, views = doublet(root), views_of(size, truth)
-    taken = views.take(lens, smooth(size + 87), "test", number)
+    taken = views.take(lens, Shot(smooth(size + 87), "test", number))
     functions = views.functions_of_images(lens, taken, "test")
     assert functions.shape == (2, 1, 3, size, size)
     (of_zone,) = views.point_spread_functions(lens)
@@ -171,7 +172,7 @@ def test_untrained_restorers_are_told_the_function_of_each_image(made):
     views, values, rival = module.views, module.variables(), WienerTVRestoration()
     textures = torch.cat([smooth(200, seed)[..., :120, :120] for seed in (1, 2)])
     with torch.no_grad():
-        taken, told = module.take(values, textures, "test", 1)
+        taken, told = module.take(values, Shot(textures, "test", 1))
         assert told is None
         found = restored_by_rivals(module, taken, told, values)["tv"]
         functions = views.functions_of_images(module.lens.with_values(values), taken, "test")
@@ -219,7 +220,7 @@ def test_the_loss_behind_a_restorer_that_is_told_functions_is_differentiable(mad
 
     def loss(at, told=None):
         scaled.data.copy_(at)
-        taken, functions = module.take(module.variables(), textures, "train", 0)
+        taken, functions = module.take(module.variables(), Shot(textures, "train", 0))
         restored = module.restore(taken, functions if told is None else told)
         return (restored - taken.truth).square().mean(), functions
 

@@ -7,6 +7,7 @@ import torch
 import yaml
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.camera.views.fields import FieldViews
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.probes import probe_image
@@ -81,7 +82,7 @@ def test_the_truth_is_registered_with_what_the_lens_shows(root):
     lens = doublet(root, stop=0.05)
     texture = probe_image(64, 72, seed=2).float()
     views = field_views(RayRenderer(Sensor(32, 40, 0.08), 8))
-    taken = views.take(lens, texture, "test", 1)
+    taken = views.take(lens, Shot(texture, "test", 1))
     assert taken.raw.shape == taken.truth.shape == (1, 5, 3, 32, 40)
     truth = srgb_to_linear(taken.truth)
     light = taken.raw.mean((-2, -1), keepdim=True) / truth.mean((-2, -1), keepdim=True)
@@ -99,7 +100,7 @@ def test_functions_and_rays_show_the_same(root):
     lens, texture = doublet(root), probe_image(72, 80, seed=3).float()
     sensor = Sensor(32, 40, 0.08)
     by_rays, by_functions = (
-        field_views(renderer).take(lens, texture, "test", 0).raw
+        field_views(renderer).take(lens, Shot(texture, "test", 0)).raw
         for renderer in (RayRenderer(sensor, 24), PsfRenderer(sensor, (2, 2), 24, 21))
     )
     error = (by_rays - by_functions).square().mean((0, 2, 3, 4)).sqrt() * 255
@@ -107,7 +108,7 @@ def test_functions_and_rays_show_the_same(root):
 
 
 def test_every_pixel_knows_its_place_in_the_field(root):
-    taken = field_views().take(doublet(root), probe_image(72, 80).float(), "test", 0)
+    taken = field_views().take(doublet(root), Shot(probe_image(72, 80).float(), "test", 0))
     radius = taken.field.norm(dim=2)
     assert float(radius[0, 0].max()) < 0.1
     assert float(radius.max()) == pytest.approx(1.0, abs=0.01)
@@ -115,7 +116,7 @@ def test_every_pixel_knows_its_place_in_the_field(root):
 
 def test_the_same_index_gives_the_same_views(root):
     lens, texture, views = doublet(root), probe_image(72, 80).float(), field_views()
-    one, again, other = (views.take(lens, texture, "train", i).raw for i in (4, 4, 5))
+    one, again, other = (views.take(lens, Shot(texture, "train", i)).raw for i in (4, 4, 5))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
 
@@ -124,7 +125,7 @@ def test_a_lens_moves_by_what_windows_show(root):
     lens, texture = doublet(root), probe_image(72, 80).float()
     curvature = lens.surfaces["1"].curvature.detach().clone().requires_grad_()
     taken = field_views().take(
-        lens.with_values({"surfaces.1.curvature": curvature}), texture, "train", 0
+        lens.with_values({"surfaces.1.curvature": curvature}), Shot(texture, "train", 0)
     )
     (slope,) = torch.autograd.grad(taken.raw.square().mean(), curvature)
     assert math.isfinite(float(slope))
@@ -144,7 +145,7 @@ def test_image_and_truth_move_together(root):
 
     def loss(views, curvature):
         taken = views.take(
-            lens.with_values({"surfaces.1.curvature": curvature}), texture, "test", 0
+            lens.with_values({"surfaces.1.curvature": curvature}), Shot(texture, "test", 0)
         )
         return (taken.raw - srgb_to_linear(taken.truth)).square().mean()
 

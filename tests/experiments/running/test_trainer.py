@@ -12,6 +12,7 @@ from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import OmegaConf
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.camera.views.fields import FieldViews
 from dolens.experiments.data.crop_loading import ResumableSampler
 from dolens.experiments.data.package_photographs import PhotosDataModule
@@ -129,11 +130,11 @@ def test_parts_of_a_batch_are_imaged_as_in_the_whole(root, kind):
     sensor = Sensor(24, 32, 0.08)
     renderer = RayRenderer(sensor, 2) if kind == "rays" else PsfRenderer(sensor, (2, 2), 6, 11)
     lens, views, textures = of_views(root, renderer)
-    whole = views.take(lens, textures, "train", 3)
+    whole = views.take(lens, Shot(textures, "train", 3))
     for first in (0, 2):
         own = slice(first, first + 2)
         share = BatchShare(first, 4)
-        part = views.take(lens, textures[own], "train", 3, None, share)
+        part = views.take(lens, Shot(textures[own], "train", 3, None, share))
         # One readout: nothing beside these.
         assert part[3:] == whole[3:] == (None, None)
         for mine, all_of_it in zip(part[:3], whole[:3], strict=True):
@@ -160,7 +161,7 @@ def test_optics_know_nothing_of_half_precision(made, dtype):
 
     def images_and_slope():
         values = module.variables()
-        taken, functions = module.take(values, textures, "train", 0)
+        taken, functions = module.take(values, Shot(textures, "train", 0))
         slope = torch.autograd.grad(
             taken.raw.sum() + functions.square().sum(), values["sensor_distance"]
         )
@@ -169,7 +170,7 @@ def test_optics_know_nothing_of_half_precision(made, dtype):
     alone = images_and_slope()
     with torch.autocast("cpu", torch.bfloat16):
         mixed = images_and_slope()
-        taken, functions = module.take(module.variables(), textures, "train", 0)
+        taken, functions = module.take(module.variables(), Shot(textures, "train", 0))
         rows = []
         module.network.network.output.register_forward_hook(lambda *seen: rows.append(seen[2]))
         restored = module.restore(taken, functions)
