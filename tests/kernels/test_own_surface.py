@@ -56,13 +56,13 @@ def test_kernels_that_take_other_numbers_than_the_surface_has_are_refused(lens, 
 
 def test_kernels_on_disk_go_by_the_file_of_the_shape_s_functions():
     """Not by that of the loops which they are inlined in, which all such surfaces share."""
-    functions = kernels_of(Paraboloid.kernel.code, "cpu").of([])
+    functions = kernels_of(Paraboloid.kernel.code, "cpu").of([], [])
     _, _, part, digest = source_of(functions.sag)
     assert part == "paraboloid_sag"
     assert source_of(functions.forward)[3] != digest
     notebook = Shape("cell", *(compile_in_no_file() for _ in range(3)), layout=())
     with pytest.raises(RuntimeError, match="in no file"):
-        source_of(kernels_of(SurfaceKernel(shape=notebook).code, "cpu").of([]).sag)
+        source_of(kernels_of(SurfaceKernel(shape=notebook).code, "cpu").of([], []).sag)
 
 
 def compile_in_no_file():
