@@ -151,6 +151,7 @@ def overlaid(lens: Any, name: str) -> Any:
         InputError: there is no such state.
     """
     check_state(lens, name)
+    lens = lens.as_stored()
     state = lens.states[name]
     own = dict(state.named_parameters())
     # What deepcopy finds here it takes as it is.

@@ -224,12 +224,10 @@ def _operands(merit: MeritFunction, sensor_distance: Tensor | None = None) -> Op
     """Return the operands' values; None where one cannot be evaluated."""
     if not merit.operands:
         return OperandValues((), (), ())
-    lens, parameters = merit.lens, merit.variables()
+    lens = merit.lens.with_values(merit.variables())
     if sensor_distance is not None:
-        parameters["sensor_distance"] = sensor_distance
+        lens = lens.with_values({"sensor_distance": sensor_distance})
     try:
-        return evaluate_operands(
-            merit.operands, lens, parameters, lens.object_distance, merit.crossings
-        )
+        return evaluate_operands(merit.operands, lens, lens.object_distance, merit.crossings)
     except UnreachableField:
         return None

@@ -1,6 +1,6 @@
 """Operands of a lens are evaluated together, and near a point their residuals are linear."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -85,7 +85,6 @@ class OperandValues:
 def evaluate_operands(
     operands: Sequence[Operand],
     lens: Lens,
-    parameters: Mapping[str, Tensor],
     object_distance: float | None,
     crossings: dict[tuple[float, float], Tensor] | None = None,
 ) -> OperandValues:
@@ -93,8 +92,7 @@ def evaluate_operands(
 
     Args:
         operands: none is allowed.
-        lens: the lens.
-        parameters: name → value, in place of the lens's own; with a graph where derivatives are
+        lens: the lens; with values that have a graph (`Lens.with_values`) where derivatives are
             asked for.
         object_distance: mm in front of the first vertex; None for infinity.
         crossings: where chief rays crossed the front at an earlier point, from which their aiming
@@ -106,7 +104,7 @@ def evaluate_operands(
     if not operands:
         return OperandValues((), (), ())
     properties = LensProperties(
-        lens.system(parameters),
+        lens.system(),
         lens.primary_wavelength,
         object_distance,
         {} if crossings is None else crossings,
@@ -152,7 +150,7 @@ class OperandModel:
             UnreachableField: a chief ray does not reach the stop.
         """
         with torch.enable_grad():
-            found = evaluate_operands(operands, lens, variables(), object_distance)
+            found = evaluate_operands(operands, lens.with_values(variables()), object_distance)
         return OperandModel.of(found, found.derivatives([variables.scaled]))
 
     @staticmethod

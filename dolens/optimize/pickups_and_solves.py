@@ -30,10 +30,8 @@ class Dependent(Protocol):
         """Return the name of the parameter."""
         ...
 
-    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the parameter's value, from the lens and the values that are known so far, by
-        name.
-        """
+    def value(self, lens: Lens) -> Tensor:
+        """Return the parameter's value, from the lens with the values that are known so far."""
         ...
 
 
@@ -54,11 +52,11 @@ class Pickup:
     factor: float = 1.0
     offset: float = 0.0
 
-    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+    def value(self, lens: Lens) -> Tensor:
         """Return the value that follows from the sources'."""
         total = torch.zeros(())
         for source in self.sources:
-            value = values.get(source)
+            value = lens.given.get(source)
             total = total + (lens.get_parameter(source).detach() if value is None else value)
         return self.factor * total + self.offset
 
@@ -80,14 +78,14 @@ class FocalLength:
     efl: float
     wavelength: float
 
-    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+    def value(self, lens: Lens) -> Tensor:
         """Return the curvature c for which P(c) = 1/EFL, 1/mm."""
         stored = lens.get_parameter(self.name).detach()
         state, _ = split_state(self.name)
-        there = lens.in_state(state)
+        there = lens.as_stored().in_state(state)
 
         def power(curvature: float) -> Tensor:
-            trial = {**values, self.name: stored.new_tensor(curvature)}
+            trial = {**lens.given, self.name: stored.new_tensor(curvature)}
             system = there.system(values_there(lens, state, trial))
             return -surface_matrix(system, self.wavelength, 1, len(system.surfaces))[1, 0]
 
@@ -110,11 +108,11 @@ class ParaxialFocus:
     defocus: float = 0.0
     name: str = "sensor_distance"
 
-    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+    def value(self, lens: Lens) -> Tensor:
         """Return the distance of the sensor from the last vertex, mm."""
         state, _ = split_state(self.name)
-        given = {n: v for n, v in values.items() if n != self.name}
-        system = lens.in_state(state).system(values_there(lens, state, given))
+        given = {n: v for n, v in lens.given.items() if n != self.name}
+        system = lens.as_stored().in_state(state).system(values_there(lens, state, given))
         image = first_order(system, self.wavelength, self.object_distance).image
         return image - system.vertices[len(system.surfaces) - 1] + self.defocus
 

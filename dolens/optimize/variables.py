@@ -175,7 +175,7 @@ class DesignVariables(nn.Module):
             for name, part, shape in zip(self.names, parts, self._shapes, strict=True)
         }
         for parameter in self.dependents:
-            values[parameter.name] = parameter.value(self._of[0], values)
+            values[parameter.name] = parameter.value(self._of[0].with_values(values))
         return values
 
     def derivatives(self) -> tuple[list[str], Tensor]:

@@ -64,8 +64,8 @@ class CameraOperands:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        own = values_in_state(lens, None, lens.given)
-        found = evaluate_operands(self.entries, lens.as_stored(), own, self.object_distance)
+        alone = lens.as_stored().with_values(values_in_state(lens, None, lens.given))
+        found = evaluate_operands(self.entries, alone, self.object_distance)
         total = torch.zeros((), device=lens.device)
         for penalty in found.penalties():
             total = total + penalty
