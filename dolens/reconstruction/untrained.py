@@ -150,7 +150,7 @@ def resampled_spectrum(power: Tensor, height: int, width: int) -> Array:
     """
     correlation = torch.fft.ifft2(power.double()).real
     for dimension, size in ((-2, height), (-1, width)):
-        shifts = torch.fft.fftfreq(size, 1.0 / size).round().long()
+        shifts = torch.fft.fftfreq(size, 1.0 / size, device=power.device).round().long()
         correlation = correlation.index_select(dimension, shifts.remainder(power.shape[dimension]))
     spectrum = torch.fft.fft2(correlation).real.clamp(min=0.0)
     spectrum = spectrum / spectrum.mean(dim=(-2, -1), keepdim=True)

@@ -1,0 +1,98 @@
+"""Cameras on a GPU, which is pretended: no operation mixes its tensors with the CPU's."""
+
+import pytest
+import torch
+
+from dolens import load_lens
+from dolens.experiments.camera.views.base import Shot
+from dolens.experiments.camera.views.fields import FieldViews
+from dolens.optics import ray_tracing
+from dolens.reconstruction.general import GeneralRestoration
+from dolens.reconstruction.untrained import WienerTVRestoration
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+from dolens.sensor.readout import Readout
+from tests.pretended_gpu import PretendedGpu
+from tests.reconstruction.scenes import blur, raw_image
+from tests.reconstruction.test_restoration import RESTORERS
+
+LINES = (656.2725, 587.5618, 486.1327)
+SENSOR = Sensor(12, 16, 0.02)
+RENDERERS = {
+    "rays": RayRenderer(SENSOR, 2),
+    "functions": PsfRenderer(
+        SENSOR, (2, 2), 4, diffraction="limit", illumination="map", registration="chief_rays"
+    ),
+    "functions by waves": PsfRenderer(SENSOR, (1, 1), 4, diffraction="wave"),
+}
+
+
+@pytest.fixture(autouse=True)
+def gpu(monkeypatch):
+    """A GPU for which no kernels can be compiled."""
+    monkeypatch.setattr(ray_tracing, "without_triton", lambda: "the GPU is pretended")
+    with PretendedGpu():
+        yield
+
+
+@pytest.fixture
+def lens():
+    return load_lens("cooke_triplet", dtype=torch.float32).to("cuda")
+
+
+def test_tensors_of_both_devices_do_not_mix():
+    here, there = torch.ones(3, device="cuda"), torch.ones(3)
+    with pytest.raises(RuntimeError, match="same device"):
+        here + there
+    with pytest.raises(TypeError, match="NumPy"):
+        here.numpy()
+    assert (here + there.to(here)).device.type == "cuda"
+    assert (here.cpu() + there).device.type == "cpu"
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_images_and_gradients_stay_there(lens, name):
+    scene = PlanarScene((8000.0, 4500.0), LINES)
+    image = RENDERERS[name].render(lens, scene, torch.rand(1, 3, 12, 16, device="cuda"), 3)
+    (gradient,) = torch.autograd.grad(image.sum(), [lens.surfaces["1"].curvature])
+    assert image.device.type == gradient.device.type == "cuda"
+
+
+def test_a_renderer_is_planned_there(lens):
+    plan = AutoRenderer(SENSOR, 4.0).make_plan(lens, PlanarScene((8000.0,), LINES[1:2]))
+    assert plan.renderer.sensor == SENSOR
+
+
+def test_a_field_is_seen_and_read_out_there():
+    lens = load_lens("large_fov_doublet", dtype=torch.float32).to("cuda")
+    views = FieldViews(
+        PlanarScene((1e5,), LINES),
+        Sensor(96, 120, 0.08),
+        PsfRenderer(Sensor(12, 16, 0.08), (2, 2), 4),
+        Readout(),
+        truth="chief_rays",
+    )
+    views.prepare(lens)
+    taken = views.take(lens, Shot(torch.rand(2, 3, 48, 48, device="cuda"), "train", 0))
+    assert taken.raw.device.type == taken.truth.device.type == "cuda"
+
+
+@pytest.mark.parametrize("kind", RESTORERS)
+def test_networks_restore_and_learn_there(kind):
+    network = RESTORERS[kind]().to("cuda")
+    raw = raw_image().float().to("cuda").requires_grad_()
+    restored = network(raw, blur().float().to("cuda"))
+    assert {g.device.type for g in torch.autograd.grad(restored.sum(), [raw])} == {"cuda"}
+
+
+@pytest.mark.parametrize("kind", [GeneralRestoration, WienerTVRestoration])
+def test_restorers_of_any_lens_are_told_the_noise(kind):
+    """As numbers on the CPU, as they come from a readout."""
+    restorer = kind().to("cuda")
+    functions = blur().float().to("cuda")
+    noise = torch.tensor([0.01, 1e-4])
+    restored = restorer(raw_image().float().to("cuda"), functions, None, noise)
+    assert restored.device.type == "cuda"
