@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -179,7 +180,7 @@ UNFINISHED = ".part"
 
 
 @contextmanager
-def written_whole(path: Path, ending: str = UNFINISHED) -> Iterator[Path]:
+def written_whole(path: Path) -> Iterator[Path]:
     """Give a path to write to, and put what was written in its place when the block ends.
 
     A full disk, an error in the block or the end of the process leaves the file that was there
@@ -188,7 +189,6 @@ def written_whole(path: Path, ending: str = UNFINISHED) -> Iterator[Path]:
 
     Args:
         path: of the file; its folder exists.
-        ending: of the name that it has until then.
 
     Yields:
         The path to write to, in the same folder, since only there a file is replaced at once.
@@ -196,7 +196,7 @@ def written_whole(path: Path, ending: str = UNFINISHED) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written, as on a full disk.
     """
-    aside = path.with_name(path.name + ending)
+    aside = path.with_name(path.name + UNFINISHED)
     try:
         yield aside
         with aside.open("rb+") as file:
@@ -235,9 +235,15 @@ def user_cache_folder() -> Path:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that other processes see whole or not at all; several may write it at once."""
-    with written_whole(path, f".{os.getpid()}{UNFINISHED}") as aside:
-        aside.write_bytes(content)
+    """Write a file that this user alone reads, and other processes see whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
 
 
 def delete_old(folder: Path) -> None:

@@ -343,7 +343,7 @@ def operands_of(design: Design, weight: float = 1.0) -> list[dict[str, object]]:
 def values_of(lens: Lens, design: Design) -> dict[str, float]:
     """Return the values of `operands_of`, mm and per cent, by label."""
     settings = [{**entry, "min": -_OPEN} for entry in operands_of(design)]
-    found = evaluate_operands([operand(e, lens) for e in settings], lens, {}, None)
+    found = evaluate_operands([operand(e, lens) for e in settings], lens, None)
     return {label: float(v) for label, v in zip(found.labels, found.tensors, strict=True)}
 
 

@@ -194,8 +194,8 @@ def test_a_run_without_one_of_its_records_is_listed_too(name, tmp_path):
 @pytest.mark.parametrize(
     "key, value, said",
     [
-        ("module", 3, "module: 3; allowed: settings, as a mapping"),
-        ("module", None, "module: None; allowed"),
+        ("module", 3, "module: 3; allowed: a mapping"),
+        ("module", None, "module: null; allowed"),
         ("module", {"a": 1}, "module: makes no experiment of a lens"),
         ("data", [1], "data: [1]; allowed"),
         ("trainer", "a", "trainer: 'a'; allowed"),
