@@ -120,7 +120,12 @@ def _run(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     given = {id(t.numbers): t for t in here}
     if not on_gpu:
         return found
-    return tree_map_only(Tensor, lambda t: given[id(t)] if id(t) in given else OnGpu(t), found)
+
+    def placed(result: Tensor) -> OnGpu:
+        # A conjugate that is not yet taken shows on the CPU's tensor alone.
+        return given[id(result)] if id(result) in given else OnGpu(result.resolve_conj())
+
+    return tree_map_only(Tensor, placed, found)
 
 
 class _Data(TorchFunctionMode):

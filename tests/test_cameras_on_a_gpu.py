@@ -54,11 +54,19 @@ def test_tensors_of_both_devices_do_not_mix():
 
 
 @pytest.mark.parametrize("name", RENDERERS)
-def test_images_and_gradients_stay_there(lens, name):
+def test_images_and_gradients_are_there_and_those_of_the_cpu(name):
     scene = PlanarScene((8000.0, 4500.0), LINES)
-    image = RENDERERS[name].render(lens, scene, torch.rand(1, 3, 12, 16, device="cuda"), 3)
-    (gradient,) = torch.autograd.grad(image.sum(), [lens.surfaces["1"].curvature])
-    assert image.device.type == gradient.device.type == "cuda"
+    texture = torch.rand(1, 3, 12, 16)
+    found = []
+    for device in ("cpu", "cuda"):
+        lens = load_lens("cooke_triplet", dtype=torch.float32).to(device)
+        lens.backend = "auto" if device == "cuda" else "reference"
+        image = RENDERERS[name].render(lens, scene, texture.to(device), 3)
+        (gradient,) = torch.autograd.grad(image.square().sum(), [lens.surfaces["1"].curvature])
+        assert image.device.type == gradient.device.type == device
+        found.append((image.detach().cpu(), gradient.cpu()))
+    for cpu, gpu in zip(*found, strict=True):
+        assert torch.equal(cpu, gpu)
 
 
 def test_a_renderer_is_planned_there(lens):
