@@ -102,6 +102,13 @@ def _run(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     if here and func is aten.index.Tensor and not isinstance(args[0], OnGpu):
         raise RuntimeError("indices should be on the CPU, as what they index")
     on_gpu = bool(here)
+    names = [argument.name for argument in func._schema.arguments[: len(args)]]
+    if "device" in names:  # without its name, as in inference mode
+        first = names.index("device")
+        args, kwargs = (
+            args[:first],
+            {**dict(zip(names[first:], args[first:], strict=True)), **kwargs},
+        )
     if kwargs.get("device") is not None:
         on_gpu = torch.device(kwargs["device"]).type != "cpu"
         kwargs["device"] = torch.device("cpu")
