@@ -27,6 +27,69 @@ _MIXING = {
 _DATA = (torch.tensor, torch.as_tensor, torch.asarray)
 
 
+def _run(
+    of: Any,
+    func: Any,
+    types: Any,
+    args: Sequence[Any] = (),
+    kwargs: Mapping[str, Any] | None = None,
+) -> Any:
+    """Run an operation by the CPU, and say where its results are: `__torch_dispatch__`."""
+    kwargs = dict(kwargs or {})
+    tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
+    here = [t for t in tensors if isinstance(t, OnGpu)]
+    sized = [t for t in tensors if not isinstance(t, OnGpu) and t.dim() > 0]
+    if here and sized and func not in _MIXING:
+        raise RuntimeError(f"Expected all tensors to be on the same device: {func}")
+    if here and func is aten.index.Tensor and not isinstance(args[0], OnGpu):
+        raise RuntimeError("indices should be on the CPU, as what they index")
+    on_gpu = bool(here)
+    names = [argument.name for argument in func._schema.arguments[: len(args)]]
+    if "device" in names:  # without its name, as in inference mode
+        first = names.index("device")
+        args, kwargs = (
+            args[:first],
+            {**dict(zip(names[first:], args[first:], strict=True)), **kwargs},
+        )
+    if kwargs.get("device") is not None:
+        on_gpu = torch.device(kwargs["device"]).type != "cpu"
+        kwargs["device"] = torch.device("cpu")
+    generator = kwargs.get("generator")
+    if isinstance(generator, Generator) and (generator.device.type == "cuda") != on_gpu:
+        raise RuntimeError(f"Expected a generator of the device of the tensor: {func}")
+    own, named = tree_map(lambda x: x.numbers if isinstance(x, OnGpu) else x, (args, kwargs))
+    if torch.Tag.inplace_view in func.tags:
+        func(*own, **named)
+        with torch._C._DisableTorchDispatch():
+            func(*args, **kwargs)  # the shape of the tensor without numbers
+        return args[0]
+    found = func(*own, **named)
+    if func is aten.copy_.default:
+        return args[0]
+    if not on_gpu:
+        return found
+    given = {id(t.numbers): t for t in here}
+
+    def placed(result: Tensor) -> OnGpu:
+        # A conjugate that is not yet taken shows on the CPU's tensor alone.
+        return given[id(result)] if id(result) in given else OnGpu(result.resolve_conj())
+
+    return tree_map_only(Tensor, placed, found)
+
+
+class Generator(torch.Generator):
+    """A generator of the CPU's numbers that may say that it is the GPU's."""
+
+    said: torch.device
+
+    def __new__(cls, device: Any = "cpu") -> "Generator":
+        made = super().__new__(cls, "cpu")
+        made.said = torch.device(device)
+        return made
+
+    device = property(lambda self: self.said)
+
+
 class OnGpu(Tensor):
     """A tensor that says that it is on the GPU; its numbers are in `numbers`, on the CPU.
 
@@ -68,71 +131,7 @@ class OnGpu(Tensor):
         memo[id(self)] = made
         return made
 
-    @classmethod
-    def __torch_dispatch__(
-        cls,
-        func: Any,
-        types: Any,
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:
-        return _run(func, args, dict(kwargs or {}))
-
-
-class Generator(torch.Generator):
-    """A generator of the CPU's numbers that may say that it is the GPU's."""
-
-    said: torch.device
-
-    def __new__(cls, device: Any = "cpu") -> "Generator":
-        made = super().__new__(cls, "cpu")
-        made.said = torch.device(device)
-        return made
-
-    device = property(lambda self: self.said)
-
-
-def _run(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    """Run an operation by the CPU, and say where its results are."""
-    tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
-    here = [t for t in tensors if isinstance(t, OnGpu)]
-    sized = [t for t in tensors if not isinstance(t, OnGpu) and t.dim() > 0]
-    if here and sized and func not in _MIXING:
-        raise RuntimeError(f"Expected all tensors to be on the same device: {func}")
-    if here and func is aten.index.Tensor and not isinstance(args[0], OnGpu):
-        raise RuntimeError("indices should be on the CPU, as what they index")
-    on_gpu = bool(here)
-    names = [argument.name for argument in func._schema.arguments[: len(args)]]
-    if "device" in names:  # without its name, as in inference mode
-        first = names.index("device")
-        args, kwargs = (
-            args[:first],
-            {**dict(zip(names[first:], args[first:], strict=True)), **kwargs},
-        )
-    if kwargs.get("device") is not None:
-        on_gpu = torch.device(kwargs["device"]).type != "cpu"
-        kwargs["device"] = torch.device("cpu")
-    generator = kwargs.get("generator")
-    if isinstance(generator, Generator) and (generator.device.type == "cuda") != on_gpu:
-        raise RuntimeError(f"Expected a generator of the device of the tensor: {func}")
-    own, named = tree_map(lambda x: x.numbers if isinstance(x, OnGpu) else x, (args, kwargs))
-    if torch.Tag.inplace_view in func.tags:
-        func(*own, **named)
-        with torch._C._DisableTorchDispatch():
-            func(*args, **kwargs)  # the shape of the tensor without numbers
-        return args[0]
-    found = func(*own, **named)
-    if func is aten.copy_.default:
-        return args[0]
-    given = {id(t.numbers): t for t in here}
-    if not on_gpu:
-        return found
-
-    def placed(result: Tensor) -> OnGpu:
-        # A conjugate that is not yet taken shows on the CPU's tensor alone.
-        return given[id(result)] if id(result) in given else OnGpu(result.resolve_conj())
-
-    return tree_map_only(Tensor, placed, found)
+    __torch_dispatch__ = classmethod(_run)
 
 
 class _Data(TorchFunctionMode):
@@ -160,14 +159,7 @@ class _Data(TorchFunctionMode):
 class PretendedGpu(TorchDispatchMode):
     """Within it `cuda` is a device on any machine."""
 
-    def __torch_dispatch__(
-        self,
-        func: Any,
-        types: Any,
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:
-        return _run(func, args, dict(kwargs or {}))
+    __torch_dispatch__ = _run
 
     def __enter__(self) -> "PretendedGpu":
         torch._C._ensureCUDADeviceGuardSet()

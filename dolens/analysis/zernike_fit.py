@@ -89,7 +89,7 @@ def zernike_polynomials(x: Tensor, y: Tensor, terms: Sequence[ZernikeTerm]) -> T
     found = [q] * len(terms)  # each is replaced below
     for m in range(max(term.m for term in terms) + 1):
         orders = [(term.n - m) // 2 for term in terms if term.m == m]
-        radial = [value for value, _ in jacobi(q, m, max(orders, default=-1) + 1)]
+        radial = list(jacobi(q, m, max(orders, default=-1) + 1))
         for place, term in enumerate(terms):
             if term.m == m:
                 azimuthal = sine if term.sine else cosine

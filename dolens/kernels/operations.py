@@ -1,7 +1,7 @@
 """A shape's functions are written in these operations, once for PyTorch, Numba and Triton.
 
 As they stand here they take tensors.  `dolens.kernels.cpu.shapes` and `dolens.kernels.cuda.shapes`
-have their counterparts for one ray and for a block of rays; `horner` and `put_powers` are written
+have their counterparts for one ray and for a block of rays; from `by_radius` on, they are written
 in the others, and translated as a shape's functions are.
 """
 
@@ -134,3 +134,27 @@ def put_powers(
         weight = number(power + step * j, q) * of_slope
         put(cotangents, place + j, of_value * upper + weight * lower)
         lower = upper
+
+
+def next_term(
+    alpha: Number, beta: Number, gamma: Number, q: Number,
+    value: Number, slope: Number, value_below: Number, slope_below: Number,
+) -> tuple[Number, Number, Number, Number]:  # fmt: skip
+    """Return P_k = (α·q + β)·P_(k-1) - γ·P_(k-2) and its derivative in q, and those of P_(k-1).
+
+    Arguments after q: P_(k-1) and its derivative, and those of P_(k-2).
+    """
+    factor = fma(alpha, q, beta)
+    above = fma(factor, value, -gamma * value_below)
+    return above, fma(factor, slope, alpha * value - gamma * slope_below), value, slope
+
+
+def next_second(
+    alpha: Number, beta: Number, gamma: Number, q: Number,
+    slope: Number, second: Number, second_below: Number,
+) -> tuple[Number, Number]:  # fmt: skip
+    """Return the second derivatives of P_k and of P_(k-1), from the derivative of P_(k-1) and the
+    second ones of P_(k-1) and P_(k-2); see `next_term`.
+    """
+    added = 2.0 * alpha * slope - gamma * second_below
+    return fma(fma(alpha, q, beta), second, added), second

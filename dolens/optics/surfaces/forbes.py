@@ -22,6 +22,8 @@ from dolens.kernels.operations import (
     divide,
     fma,
     length,
+    next_second,
+    next_term,
     number,
     put,
     sqrt,
@@ -68,11 +70,7 @@ def _total(b: Series, q: Number, like: Number, best_fit: Number) -> tuple[Number
         t = fma(term(b, i), p, t)
         t1 = fma(term(b, i), d, t1)
         alpha, beta, gamma = _step(number(i + 1, like), best_fit)
-        factor = fma(alpha, q, beta)
-        d_above = fma(factor, d, alpha * p - gamma * d_below)
-        p_above = fma(factor, p, -gamma * p_below)
-        p_below, d_below = p, d
-        p, d = p_above, d_above
+        p, d, p_below, d_below = next_term(alpha, beta, gamma, q, p, d, p_below, d_below)
     return t, t1
 
 
@@ -88,12 +86,8 @@ def _total_second(
         t1 = fma(term(b, i), d, t1)
         t2 = fma(term(b, i), e, t2)
         alpha, beta, gamma = _step(number(i + 1, like), best_fit)
-        factor = fma(alpha, q, beta)
-        e_above = fma(factor, e, 2.0 * alpha * d - gamma * e_below)
-        d_above = fma(factor, d, alpha * p - gamma * d_below)
-        p_above = fma(factor, p, -gamma * p_below)
-        p_below, d_below, e_below = p, d, e
-        p, d, e = p_above, d_above, e_above
+        e, e_below = next_second(alpha, beta, gamma, q, d, e, e_below)
+        p, d, p_below, d_below = next_term(alpha, beta, gamma, q, p, d, p_below, d_below)
     return t, t1, t2
 
 
@@ -107,11 +101,7 @@ def _put_terms(
     for i in range(length(b)):
         put(cotangents, 3 + i, of_value * p + of_slope * d)
         alpha, beta, gamma = _step(number(i + 1, like), best_fit)
-        factor = fma(alpha, q, beta)
-        d_above = fma(factor, d, alpha * p - gamma * d_below)
-        p_above = fma(factor, p, -gamma * p_below)
-        p_below, d_below = p, d
-        p, d = p_above, d_above
+        p, d, p_below, d_below = next_term(alpha, beta, gamma, q, p, d, p_below, d_below)
 
 
 def q_con_sag(p: Any, x: Number, y: Number) -> tuple[Number, Number, Number, Number]:

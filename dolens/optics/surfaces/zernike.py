@@ -22,6 +22,8 @@ from dolens.kernels.operations import (
     entry,
     fma,
     length,
+    next_second,
+    next_term,
     number,
     put,
     sqrt,
@@ -142,10 +144,9 @@ def terms_slopes(
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
             alpha, beta, gamma = jacobi_step(number(k, like), m)
-            factor = fma(alpha, q, beta)
-            above = fma(factor, value, -gamma * value_below)
-            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
-            value_below, slope_below, value, slope = value, slope, above, slope_above
+            value, slope, value_below, slope_below = next_term(
+                alpha, beta, gamma, q, value, slope, value_below, slope_below
+            )
         norm = sqrt(number(entry(table, 3 * t + 2), like))
         a, b = norm * term(terms, 2 * t), norm * term(terms, 2 * t + 1)
         both = fma(a, c, b * s)
@@ -181,12 +182,10 @@ def terms_second(
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
             alpha, beta, gamma = jacobi_step(number(k, like), m)
-            factor = fma(alpha, q, beta)
-            above = fma(factor, value, -gamma * value_below)
-            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
-            second_above = fma(factor, second, 2.0 * alpha * slope - gamma * second_below)
-            value_below, slope_below, second_below = value, slope, second
-            value, slope, second = above, slope_above, second_above
+            second, second_below = next_second(alpha, beta, gamma, q, slope, second, second_below)
+            value, slope, value_below, slope_below = next_term(
+                alpha, beta, gamma, q, value, slope, value_below, slope_below
+            )
         norm = sqrt(number(entry(table, 3 * t + 2), like))
         a, b = norm * term(terms, 2 * t), norm * term(terms, 2 * t + 1)
         both, along, across = fma(a, c, b * s), m * (a * c1 + b * s1), m * (b * c1 - a * s1)
@@ -229,10 +228,9 @@ def put_terms(
                 c, s = fma(c1, u, -s1 * v), fma(s1, u, c1 * v)
         else:
             alpha, beta, gamma = jacobi_step(number(k, like), m)
-            factor = fma(alpha, q, beta)
-            above = fma(factor, value, -gamma * value_below)
-            slope_above = fma(factor, slope, alpha * value - gamma * slope_below)
-            value_below, slope_below, value, slope = value, slope, above, slope_above
+            value, slope, value_below, slope_below = next_term(
+                alpha, beta, gamma, q, value, slope, value_below, slope_below
+            )
         norm = sqrt(number(entry(table, 3 * t + 2), like))
         of_value, of_derivative = norm * value, norm * slope * of_slope
         of_c = of_sum * c + m * (of_u * c1 - of_v * s1)
@@ -386,18 +384,11 @@ class ZernikeFringe(ZernikeSag):
     term = staticmethod(fringe)
 
 
-def jacobi(q: Tensor, m: int, count: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield P_k^(0, m)(2q - 1) and its derivative in q, for k = 0, 1, ..., count - 1."""
-    value, slope = torch.ones_like(q), torch.zeros_like(q)
-    lower, lower_slope = torch.zeros_like(q), torch.zeros_like(q)
+def jacobi(q: Tensor, m: int, count: int) -> Iterator[Tensor]:
+    """Yield P_k^(0, m)(2q - 1) for k = 0, 1, ..., count - 1."""
+    value, below = torch.ones_like(q), torch.zeros_like(q)
     for k in range(count):
         if k > 0:
-            a, b, c = jacobi_step(float(k), float(m))
-            factor = a * q + b
-            value, lower, slope, lower_slope = (
-                factor * value - c * lower,
-                value,
-                factor * slope + a * value - c * lower_slope,
-                slope,
-            )
-        yield value, slope
+            alpha, beta, gamma = jacobi_step(float(k), float(m))
+            value, below = (alpha * q + beta) * value - gamma * below, value
+        yield value
