@@ -37,11 +37,11 @@ class MovingAverage:
 
     def add(self, number: float, steps: int = 1) -> None:
         """Take a further number into account, so many steps after the one before."""
-        self._last = number
         if math.isfinite(number):
             share = self.smoothing**steps
             self._sum = share * self._sum + number
             self._weight = share * self._weight + 1.0
+        self._last = number  # at the end: another thread may ask for the value meanwhile
 
     @property
     def value(self) -> float:

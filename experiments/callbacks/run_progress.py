@@ -1,5 +1,6 @@
 """A callback follows the progress of a run for its display."""
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -105,15 +106,15 @@ class RunProgress(ProgressBar):
     # ---------------------------------------------------------------- the state
 
     def snapshot(self) -> Snapshot:
-        """Return the present state."""
+        """Return the present state; a display's own thread may ask while a step is counted."""
         now, step_s = self._now, self._step_s.value
-        names, since = self._stages[-1] if self._stages else ((), 0.0)
+        names, since = [((), 0.0), *self._stages][-1]
         return Snapshot(
             now.name,
             now.done,
             now.total,
             now.detail,
-            {name: average.value for name, average in self._numbers.items()},
+            {name: average.value for name, average in dict(self._numbers).items()},
             1.0 / step_s if now.name == "fit" and step_s > 0.0 else None,
             now.remaining_s(),
             names,
@@ -125,7 +126,7 @@ class RunProgress(ProgressBar):
             self._stages.append((event.names, time.monotonic()))
         elif self._stages:
             _, since = self._stages.pop()
-            if not self._stages:
+            if not self._stages and self._now.name == "fit":  # a validation is apart as a whole
                 self._apart_s += time.monotonic() - since
         self._display.update(force=True)
 
@@ -133,8 +134,9 @@ class RunProgress(ProgressBar):
         """Take the metrics that are marked for a progress bar; smooth those of training."""
         for name, value in self.trainer.progress_bar_metrics.items():
             smoothing = self.smoothing if name.startswith("train/") else 0.0
-            average = self._numbers.setdefault(name, MovingAverage(smoothing))
+            average = self._numbers.get(name) or MovingAverage(smoothing)
             average.add(float(value), max(self._unread, 1))
+            self._numbers[name] = average  # none is shown before its first number
         self._looked, self._unread = time.monotonic(), 0
 
     # ---------------------------------------------------------------- training
@@ -193,7 +195,7 @@ class RunProgress(ProgressBar):
 
     def _evaluate(self, trainer: lightning.Trainer, part: str, split: str, batches: Any) -> None:
         total = sum(batches) if isinstance(batches, list) else batches
-        self._now = _Part(part, None if total == float("inf") else int(total))
+        self._now = _Part(part, total)
         find = getattr(trainer.datamodule, "evaluation_photographs", None)
         self._names, self._seen = [] if find is None else find(split), 0
 
@@ -233,12 +235,13 @@ class _Part:
 
     Args:
         name: `fit`, `validate` or `test`.
-        total: steps in all; None: nobody knows.
+        total: steps in all; None or infinite, as of data without a length: nobody knows.
         done: before it began here, as of a run that is resumed.
     """
 
-    def __init__(self, name: str, total: int | None, done: int = 0) -> None:
-        self.name, self.total, self.done, self.detail = name, total, done, ""
+    def __init__(self, name: str, total: float | None, done: int = 0) -> None:
+        self.name, self.done, self.detail = name, done, ""
+        self.total = int(total) if total is not None and math.isfinite(total) else None
         self.began = time.monotonic()
         self._from: tuple[int, float] | None = None if name == "fit" else (done, self.began)
 

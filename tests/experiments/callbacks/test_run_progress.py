@@ -4,6 +4,7 @@ import io
 import logging
 import math
 import time
+from types import SimpleNamespace
 
 import lightning
 import pytest
@@ -49,6 +50,18 @@ def test_an_average_follows_numbers_as_its_weights_say_and_hides_no_nan(
     for number in numbers:
         found.add(number)
     assert found.value == pytest.approx(average, rel=1e-14, nan_ok=True)
+
+
+def test_an_average_can_be_looked_at_while_its_first_number_is_added():
+    class Watched(float):
+        def __radd__(self, other):
+            seen.append(average.value)
+            return other + float(self)
+
+    average, seen = MovingAverage(0.5), []
+    average.add(Watched(2.0))
+    assert len(seen) == 1 and math.isnan(seen[0])
+    assert average.value == 2.0
 
 
 def test_durations_and_speeds_are_for_people():
@@ -223,6 +236,62 @@ def test_a_run_is_followed_from_its_first_second(tmp_path, caplog, monkeypatch):
     (line,) = (m for m in caplog.messages if m.startswith("fit: 12 steps"))
     assert 1.3 < float(line.partition("loss ")[2].split(",")[0]) < 1.7
     assert line.endswith("val/psnr_db 22")
+
+
+def test_a_display_of_another_thread_sees_whole_numbers():
+    class Interrupted(MovingAverage):
+        """The training's thread reads further metrics while the display reads this one."""
+
+        @property
+        def value(self):
+            callback._read_numbers()
+            return super().value
+
+    class Loss:
+        """The display looks while the training's thread reads this metric."""
+
+        def __float__(self):
+            seen.append(dict(callback.snapshot().numbers))
+            return 0.5
+
+    seen = []
+    callback = RunProgress()
+    callback._trainer = SimpleNamespace(progress_bar_metrics={"train/loss": Loss()})
+    callback._read_numbers()
+    assert seen == [{}]
+    callback._numbers = {"train/first": Interrupted(0.5)}
+    callback._numbers["train/first"].add(3.0)
+    callback._trainer.progress_bar_metrics = {"train/loss": 0.5}
+    assert callback.snapshot().numbers == {"train/first": 3.0}
+    assert "train/loss" in callback._numbers
+
+
+def test_what_a_validation_does_within_an_epoch_is_no_time_of_a_step(tmp_path, monkeypatch):
+    class Looking(Slow):
+        def validation_step(self, batch, index):
+            with stage("rendering"):
+                time.sleep(1.0)
+
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    trainer, made = followed(tmp_path, module := Looking(), val_check_interval=2)
+    trainer.fit(module, Photographs())
+    speeds = [s.steps_per_second for s in made[0].states if s.part == "fit" and s.done]
+    assert speeds == pytest.approx([50.0] * len(speeds))  # steps of 0.02 s
+
+
+def test_training_data_without_a_length_have_no_known_end(tmp_path):
+    class Stream(torch.utils.data.IterableDataset):
+        def __iter__(self):
+            return iter(torch.zeros(4, 1))
+
+    trainer, made = followed(tmp_path, module := Slow())
+    trainer.fit(module, torch.utils.data.DataLoader(Stream(), batch_size=2))
+    steps = [s for s in made[0].states if s.part == "fit" and s.done]
+    assert steps[-1].done == 6
+    assert {(s.total, s.remaining_s) for s in steps} == {(None, None)}
+    assert plain_text(steps[-1]).startswith("fit step 6, ")
 
 
 def test_the_display_is_closed_when_a_run_fails(tmp_path):
