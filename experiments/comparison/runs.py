@@ -23,7 +23,7 @@ from dolens.experiments.running.run_files import (
     info_of,
     job_of,
     metrics_of,
-    read_yaml,
+    read_settings,
 )
 from dolens.experiments.running.run_settings import objective_names
 from dolens.experiments.settings import register_resolvers
@@ -103,7 +103,7 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
         if not (folder / name).exists():
             raise InputError(f"{folder} is no finished run folder: {name} is missing")
     job = job_of(folder)
-    config = read_yaml(folder / CONFIG) or {}
+    config = read_settings(folder / CONFIG) or {}
     values = _resolved(folder, config)
     own = _settings(config, values)
     if _continues(config, own, job):
@@ -187,7 +187,7 @@ def _continues(config: Mapping[str, Any], own: Mapping[str, str], job: JobRecord
     path = config.get("ckpt_path")
     if not isinstance(path, str) or not config.get("train", True):
         return False
-    before = read_yaml((Path(job.cwd) / path).resolve().parent.parent / CONFIG)
+    before = read_settings((Path(job.cwd) / path).resolve().parent.parent / CONFIG)
     if before is None:
         return False
     mine = {key: value for key, value in own.items() if key != "ckpt_path"}
@@ -197,7 +197,7 @@ def _continues(config: Mapping[str, Any], own: Mapping[str, str], job: JobRecord
 
 def _resolved(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return all settings with interpolations resolved, as far as they can be."""
-    resolved = read_yaml(folder / RESOLVED)
+    resolved = read_settings(folder / RESOLVED)
     if resolved is not None:
         return dict(flat(resolved))
     register_resolvers()

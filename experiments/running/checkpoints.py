@@ -17,7 +17,7 @@ from torch import Tensor
 from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment, refuse_another
 from dolens.experiments.running.recorded_run import RecordedRun
-from dolens.experiments.running.run_files import flat
+from dolens.experiments.running.run_files import flat, present_settings
 from dolens.files import resolved_path, written_whole
 
 logger = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ def checked_checkpoint(
             path,
         )
     else:
-        _compare(written, settings, training)
+        _compare(present_settings(written), settings, training)
     most, epoch = settings.get("trainer.max_epochs"), checkpoint.get("epoch", 0)
     if training and isinstance(most, int) and 0 <= most <= epoch:
         raise InputError(

@@ -22,7 +22,7 @@ from dolens.experiments.running.run_files import (
     info_of,
     job_of,
     overrides_of,
-    read_yaml,
+    read_settings,
     walk,
 )
 from dolens.experiments.running.run_settings import RunSettings
@@ -99,10 +99,7 @@ def read_record(
     _check_folder(folder)
     output = folder if output is None else resolved_path(output)
     job = job_of(folder)
-    config = read_yaml(folder / RESOLVED) or {}
-    for key in ("experiment", "folder"):  # of run folders of old: an experiment is told by its run
-        if isinstance(config.get("module"), dict):
-            config["module"].pop(key, None)
+    config = read_settings(folder / RESOLVED) or {}
     for path, value, _ in walk("", config):
         if isinstance(value, str) and "${" in value:
             raise InputError(f"{folder / RESOLVED}: {path} is '{value}', and not resolved")

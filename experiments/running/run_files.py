@@ -21,6 +21,8 @@ INFO, METRICS = "run.json", "metrics.json"
 CONFIG, RESOLVED = ".hydra/config.yaml", ".hydra/resolved.yaml"
 OVERRIDES, HYDRA = ".hydra/overrides.yaml", ".hydra/hydra.yaml"
 _GIVEN_UP = ("pruned", "repeated")
+# Arguments that modules of dolens had once: an experiment is told both by its run.
+_GONE = ("experiment", "folder")
 # No record of a run comes near these.
 _MOST_BYTES, _DEEPEST = 8_000_000, 40
 # Control characters, which a terminal obeys, and halves of letters, which nothing can write.
@@ -78,6 +80,36 @@ def read_yaml(path: Path) -> dict[str, Any] | None:
     """
     text = _text(path)
     return None if text is None else _mapping(path, plain_values(text, str(path)))
+
+
+def read_settings(path: Path) -> dict[str, Any] | None:
+    """Read the configuration of a run as `present_settings`; None where there is no file.
+
+    Args:
+        path: of the file, `CONFIG` or `RESOLVED` in a run folder.
+
+    Raises:
+        InputError: the file is damaged, or holds something else.
+    """
+    found = read_yaml(path)
+    return None if found is None else present_settings(found)
+
+
+def present_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings, nested or flat, less those that modules of dolens no longer have.
+
+    A user's own module keeps arguments of these names.
+    """
+    module = settings.get("module")
+    if isinstance(module, dict):
+        kept = {"module": {key: value for key, value in module.items() if key not in _GONE}}
+        target = module.get("_target_")
+    else:
+        kept, target = {}, settings.get("module._target_")
+    if not str(target).startswith("dolens."):
+        return dict(settings)
+    gone = {f"module.{key}" for key in _GONE}
+    return {key: value for key, value in settings.items() if key not in gone} | kept
 
 
 def info_of(folder: Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from dolens.experiments.running.run_files import (
     flat,
     is_finished,
     metrics_of,
+    read_settings,
     read_yaml,
 )
 from dolens.prescriptions.plain_values import plain_values
@@ -185,7 +186,7 @@ def refuse_other_settings(folder: Path, settings: str) -> None:
     """
     if not (folder / INFO).is_file():
         return  # no run got so far as to compute anything
-    written = read_yaml(folder / CONFIG) or {}
+    written = read_settings(folder / CONFIG) or {}
     if written.get("ckpt_path") == str(folder / _LAST):
         written["ckpt_path"] = None  # the run was stopped before, and had gone on
     differences = _differences(_plain(written), _plain(plain_values(settings, "the job")))

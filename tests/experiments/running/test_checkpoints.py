@@ -6,10 +6,15 @@ import pickle
 
 import pytest
 import torch
+import yaml
 
 from dolens.errors import InputError
+from dolens.experiments.comparison.runs import read_run
 from dolens.experiments.running.checkpoints import SETTINGS, read_checkpoint
-from tests.experiments.runs import Finished
+from dolens.experiments.running.finished_run import load_run
+from dolens.experiments.running.run_files import CONFIG, present_settings
+from dolens.experiments.sweeps.job import refuse_other_settings
+from tests.experiments.runs import Finished, change_setting
 from tests.experiments.tiny_experiment import CAMERA, ONE_EPOCH, TRAINED, UNPICTURED, UNTESTED
 
 ONCE = [*CAMERA, UNPICTURED, ONE_EPOCH]
@@ -98,6 +103,43 @@ def test_a_run_refuses_a_checkpoint_in_one_line(refused, tmp_path, case):
     if content is not None:
         torch.save(content, tmp_path / "any.ckpt")
     refused(said, *asked, f"ckpt_path={tmp_path / 'any.ckpt'}")
+
+
+def test_a_run_of_old_is_read_as_one_of_now(trained, tiny_run, run_copy, caplog):
+    """Modules were told their run's name and folder by two settings once."""
+    gone = {
+        "experiment": "${hydra:runtime.choices.experiment}",
+        "folder": "${hydra:runtime.output_dir}",
+    }
+    config = yaml.safe_load((run_copy / CONFIG).read_text())
+    config["module"] |= gone
+    (run_copy / CONFIG).write_text(yaml.safe_dump(config, sort_keys=False))
+    change_setting(run_copy, "module.experiment", "wavefront_coding")
+    change_setting(run_copy, "module.folder", str(tiny_run))
+    checkpoint = Finished(run_copy).checkpoint()
+    checkpoint[SETTINGS] |= {f"module.{key}": value for key, value in gone.items()}
+    torch.save(checkpoint, Finished(run_copy).last)
+
+    assert load_run(run_copy).experiment == "wavefront_coding"
+    old, new = read_run(run_copy), read_run(tiny_run)
+    assert old.key() == new.key() and old.values.keys() == new.values.keys()
+    refuse_other_settings(run_copy, (tiny_run / CONFIG).read_text())
+    resumed = trained(
+        *TRAINED, *UNTESTED, "trainer.max_epochs=2", f"ckpt_path={Finished(run_copy).last}"
+    )
+    assert differences(caplog) == ["trainer.max_epochs is 2, was 1"]
+    assert resumed.checkpoint()["global_step"] == 4
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"module": {"_target_": "mine.Camera", "folder": "figures"}},
+        {"module._target_": "mine.Camera", "module.folder": "figures"},
+    ],
+)
+def test_a_module_of_one_s_own_may_have_a_folder(settings):
+    assert present_settings(settings) == settings
 
 
 def test_settings_that_differ_are_named_in_one_line(trained, first, caplog):
