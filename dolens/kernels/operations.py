@@ -1,8 +1,8 @@
 """A shape's functions are written in these operations, once for PyTorch, Numba and Triton.
 
-As they stand here they take tensors.  `dolens.kernels.cpu.shapes` and `dolens.kernels.cuda.shapes`
-have their counterparts for one ray and for a block of rays; from `by_radius` on, they are written
-in the others, and translated as a shape's functions are.
+As they stand here they take tensors.  `dolens.kernels.cpu.translation` and `cuda.translation` have
+their counterparts for one ray and for a block of rays; from `by_radius` on, they are written in the
+others, and translated as a shape's functions are.
 """
 
 import math

@@ -1,4 +1,5 @@
-"""Surfaces and laws of deflection name the modules of their kernels, imported when first needed.
+"""Surfaces and laws of deflection name their kernels: plain functions, or modules that are imported
+when first needed.
 
 A surface class carries a `SurfaceKernel`, and a law a `LawKernel`.  Its `code` marks its steps in a
 table, so that the kernels know no list of surfaces: a new one is its own modules.

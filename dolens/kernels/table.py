@@ -69,10 +69,10 @@ class Code:
     REFRACTS = 5  # 0: the same medium on both sides, and no mirror
     EDGE = 6  # an `Outline`
     HOLE = 7
-    COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
+    COUNT = 8  # numbers of a series; rows of a spline
+    COLUMNS = 9  # of a spline or a grid; numbers of a second series
     EXTRAS = 10  # offset in `extras`
-    DEGREE = 11  # highest power of x or y
+    DEGREE = 11  # rows of a grid
     # Of a deflection.  Its record holds its surface's shape, of three numbers at least, then the
     # law's.
     LAW = 12  # the code of its `LawKernel`

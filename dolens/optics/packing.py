@@ -117,9 +117,9 @@ def _look_up(system: OpticalSystem, sense: float, first: int, last: int, to_sens
         if law is None:
             laws.append(None)
         else:
-            of_law = law.law.packed(law.parameters, sense > 0.0)
             if law.law.kernel is None:
                 raise InputError(f"surface {number}: a {law.law.kind} has no kernel")
+            of_law = law.law.packed(law.parameters, sense > 0.0)
             kinds.add(law.law)
             sizes = _sizes(of_law.numbers)
             laws.append(LawForm(law.law.kernel.code, of_law.count, of_law.extras, sizes))

@@ -30,8 +30,8 @@ class Form(NamedTuple):
     Attributes:
         kind: the code of its kernel, or `BREAK` of a coordinate break, which is no step.
         count: as in `PackedShape`, and the three that follow.
-        columns: of a spline; 1 for a polynomial with a b·z² term.
-        degree: highest power of x or y.
+        columns: of a spline or a grid, or numbers of a second series.
+        degree: rows of a grid.
         extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
         data: as in `PackedShape`.

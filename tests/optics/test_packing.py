@@ -12,6 +12,7 @@ from torch.func import functional_call
 from dolens import InputError, Rays, load_lens
 from dolens.optics import ray_tracing
 from dolens.optics.jacobian import ray_jacobian
+from dolens.optics.packing import pack
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.phase import Grating
@@ -293,3 +294,12 @@ def test_a_kernel_is_not_inherited_by_another_sag(registered):
     lens.backend = "cpu"
     with pytest.raises(InputError, match=r"surface 1 \(leaning\) has no kernel"):
         lens.trace(rays)
+
+
+def test_a_law_without_a_kernel_is_named(monkeypatch):
+    monkeypatch.setattr(Grating, "kernel", None)
+    phase = {"type": "grating", "grooves": 100.0}
+    surface = {"type": "plane", "semi_diameter": 8.0, "material": "1.5", "phase": phase}
+    lens = lens_from_prescription({"surfaces": {"1": surface}, "sensor": {"distance": 20.0}})
+    with pytest.raises(InputError, match="surface 1: a grating has no kernel"):
+        pack(lens.system(), 550.0, 1.0, 1, 1, True)

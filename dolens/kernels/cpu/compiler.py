@@ -143,8 +143,7 @@ def stamped_sources() -> list[Path]:
     limits are among them.
     """
     here = Path(__file__).parent
-    above = ("conic.py", "operations.py", "refraction.py", "shapes.py", "table.py")
-    return [*sorted(here.rglob("*.py")), *(here.parent / name for name in above)]
+    return sorted([*here.rglob("*.py"), *here.parent.glob("*.py")])
 
 
 @cache

@@ -73,8 +73,8 @@ TURN_XX, TURN_XY, TURN_XZ, TURN_YX, TURN_YY, TURN_YZ, TURN_ZX, TURN_ZY, TURN_ZZ 
 )
 POSE = 12  # numbers of a change of axes: its step and its turn
 SHAPE = Slot.HEADER  # the first number of a shape
-# Behind c, k and a2: the even coefficients, and what other shapes add; and their cotangents.
-BEHIND_ASPHERE, OF_BEHIND_ASPHERE = SHAPE + 3, OF_SHAPE + 3 * BLOCK
+# Behind c, k and a2: the even coefficients, and what other shapes add.
+BEHIND_ASPHERE = SHAPE + 3
 SHORT_RECORD = 32  # as many numbers as any kernel reads by name
 
 KIND, OFFSET, LENGTH = Code.KIND, Code.OFFSET, Code.LENGTH
@@ -82,17 +82,15 @@ BEFORE, AFTER, REFRACTS = Code.BEFORE, Code.AFTER, Code.REFRACTS
 OUTLINE, HOLE = Code.EDGE, Code.HOLE
 COUNT, COLUMNS, DEGREE = Code.COUNT, Code.COLUMNS, Code.DEGREE
 WAVE, NUMBERS, FIGURES = Code.WAVE, Code.NUMBERS, Code.FIGURES
-# The CPU's rows go on with addresses: of the step's compiled functions, and of its extras.
-FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS, EXTRAS_ADDRESS = range(
-    Code.ROW, Code.ROW + 6
-)
+# The CPU's rows go on with addresses, of the step's compiled functions.
+FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS = range(Code.ROW, Code.ROW + 5)
 # Whether a surface given by its sag is met from its conic, and whether it has a stencil.
-STARTS_ON_CONIC, STENCIL = Code.ROW + 6, Code.ROW + 7
+STARTS_ON_CONIC, STENCIL = Code.ROW + 5, Code.ROW + 6
 # Block functions of a phase.
-PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 8, Code.ROW + 11)
+PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 7, Code.ROW + 10)
 # Those of the even asphere that other shapes add to.
-ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 11, Code.ROW + 14)
-CODE_ROW = Code.ROW + 14
+ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 10, Code.ROW + 13)
+CODE_ROW = Code.ROW + 13
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 CIRCLE, RECTANGLE, ELLIPSE = int(Outline.CIRCLE), int(Outline.RECTANGLE), int(Outline.ELLIPSE)

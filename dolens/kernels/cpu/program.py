@@ -37,7 +37,6 @@ from dolens.kernels.cpu.layout import (
     BLOCK,
     CODE_ROW,
     COTANGENT_HEADER,
-    EXTRAS_ADDRESS,
     FORWARD,
     PARAMETERS,
     PHASE_AND_SLOPES,
@@ -138,7 +137,7 @@ class Frame(NamedTuple):
     """What programs of the same steps have in common.
 
     Attributes:
-        codes: of `Steps`, with the address of each step's extras; not to be written to.
+        codes: of `Steps`; not to be written to.
         job: a program's, but for the addresses of its table and rays; likewise.
         memory: bytes of a worker: its job first.
         parts: of the memory: the place of each in a job, and where it begins, bytes.
@@ -151,23 +150,18 @@ class Frame(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _frame(
-    key: tuple[bytes, bytes, str, bool], extras: int, outputs: int, columns: int, size: int
-) -> Frame:
+def _frame(key: tuple[bytes, bytes, str, bool], outputs: int, columns: int, size: int) -> Frame:
     """Return the frame of programs.
 
     Args:
         key: what `_steps` is a function of.
-        extras: the address of the table's.
         outputs: sets of cotangents that a block holds.
         columns: further rows of a block that a driver asks for.
         size: bytes of a number.
     """
     steps, derivatives = _steps(*key), key[-1]
-    codes = steps.codes.copy()
-    codes[:, EXTRAS_ADDRESS] = extras + 8 * codes[:, Code.EXTRAS]
     job = np.zeros(jobs.LENGTH, dtype=np.int64)
-    job[jobs.STEPS], job[jobs.CODES] = len(key[0]) // (8 * Code.ROW), codes.ctypes.data
+    job[jobs.STEPS], job[jobs.CODES] = len(key[0]) // (8 * Code.ROW), steps.codes.ctypes.data
     job[jobs.CLIP] = steps.clip
     # All of them with derivatives, else two in turn; and some that a driver may keep.
     states = int(job[jobs.STEPS]) + 3 if derivatives else 5
@@ -184,15 +178,14 @@ def _frame(
     ):
         parts.append((place, end))
         end += length
-    return Frame(codes, job, end, tuple(parts))
+    return Frame(steps.codes, job, end, tuple(parts))
 
 
 def frame_of(table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0) -> Frame:
     """Return the frame of a table's programs; the arguments are `Program`'s."""
-    values, extras = table.values, table.extras
-    integers = (table.codes.numpy().tobytes(), extras.numpy().tobytes())
-    key = (*integers, REAL[values.dtype], derivatives)
-    return _frame(key, extras.data_ptr(), outputs, columns, values.itemsize)
+    integers = (table.codes.numpy().tobytes(), table.extras.numpy().tobytes())
+    key = (*integers, REAL[table.values.dtype], derivatives)
+    return _frame(key, outputs, columns, table.values.itemsize)
 
 
 def _compile_sag(

@@ -9,13 +9,12 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from llvmlite import ir
-from numba import carray, njit, types
+from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 from dolens.kernels.cpu.compiler import (
     INTEGERS,
-    OPTIONS,
     Factory,
     Row,
     StepFunctions,
@@ -41,21 +40,11 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.translation import operations_of, translation
+from dolens.kernels.cpu.translation import scalar
 from dolens.kernels.shapes import TABLE, Shape, functions_within
 from dolens.kernels.table import Code
 
 _INTEGER = ir.IntType(64)
-
-
-@cache
-def _translations(real: types.Type) -> dict[Any, Any]:
-    return dict(operations_of(real))
-
-
-def _compiled(function: Callable[..., Any], real: types.Type) -> Any:
-    """Return a shape's function for a precision, inlined where it is called."""
-    return translation(function, real, _translations(real), njit(inline="always", **OPTIONS))
 
 
 Size = int | tuple[int, ...] | None
@@ -124,7 +113,7 @@ def block_factory(
     """
 
     def factory(real: types.Type) -> Callable[..., None]:
-        return block(real, _compiled(function, real), _unpacked(real, sizes))
+        return block(real, scalar(function, real, "always"), _unpacked(real, sizes))
 
     factory.__name__, factory.__qualname__ = name, f"{name}{sizes}"
     factory.within = functions_within(function)  # type: ignore[attr-defined]

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from functools import cache
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -116,28 +115,25 @@ def operations_of(real: types.Type) -> dict[Any, Any]:
     return {getattr(operations, one.__name__): one for one in own}
 
 
-def translation(
-    function: Callable[..., Any],
-    real: types.Type,
-    known: dict[Any, Any],
-    compiled: Callable[[FunctionType], Any],
-) -> Any:
-    """Return a function compiled for a precision, with those that it calls; see `translated`."""
-    literal = _AS_REAL[real]
-    return translated(
-        function,
-        known,
-        compiled,
-        literal,
-        lambda value: literal(value) if isinstance(value, float) else value,
-    )
-
-
 @cache
-def _scalars(real: types.Type) -> dict[Any, Any]:
+def _translations(real: types.Type, inline: str) -> dict[Any, Any]:
     return dict(operations_of(real))
 
 
-def scalar(function: Callable[..., Any], real: types.Type) -> Any:
-    """Return a function of one ray's numbers for a precision, compiled by itself."""
-    return translation(function, real, _scalars(real), njit(**OPTIONS))
+def scalar(function: Callable[..., Any], real: types.Type, inline: str = "never") -> Any:
+    """Return a function of one ray's numbers for a precision, with those that it calls; see
+    `translated`.
+
+    Args:
+        function: written in `dolens.kernels.operations`.
+        real: the precision.
+        inline: `never`: compiled by itself; `always`: Numba inlines it where it is called.
+    """
+    literal = _AS_REAL[real]
+    return translated(
+        function,
+        _translations(real, inline),
+        njit(inline=inline, **OPTIONS),
+        literal,
+        lambda value: literal(value) if isinstance(value, float) else value,
+    )

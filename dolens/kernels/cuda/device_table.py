@@ -15,7 +15,7 @@ from triton.runtime.interpreter import InterpretedFunction
 
 from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
-from dolens.kernels.cuda.functions import LawShape, SagFunctions, Shape, law_of, shape_of
+from dolens.kernels.cuda.functions import LawShape, Shape, law_of, shape_of
 from dolens.kernels.cuda.layout import WITH_FIGURES
 from dolens.kernels.cuda.trace import forward_kernel
 from dolens.kernels.surface_kernel import kernels_of, law_kernels_of
@@ -81,7 +81,7 @@ class DeviceCodes(NamedTuple):
 
     Attributes:
         codes: (steps, Code.ROW), int32.
-        extras: int32; the table's, and behind them what shapes have made of them.
+        extras: int32, the table's.
         before: (steps,), int64, rows of the indices; and after.
         after: and behind.
         kinds: bit k is set where there is a step of kind k, and one where there are figures.
@@ -104,8 +104,8 @@ class DeviceCodes(NamedTuple):
 def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
     """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
-    own = np.frombuffer(extras, dtype=np.int64).tolist()
-    device_extras, kinds, forms, laws = list(own), 0, set(), set()
+    own = torch.tensor(np.frombuffer(extras, dtype=np.int64), dtype=torch.int32)
+    kinds, forms, laws = 0, set(), set()
     for row in rows:
         kind = row[Code.KIND]
         if kind < Kind.BY_SAG:
@@ -115,18 +115,12 @@ def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCo
         if kind == Kind.DEFLECT:
             laws.add(law_of(row[Code.LAW], law_kernels_of(row[Code.LAW], "cuda")))
             kind = row[Code.BASE]
-        if kind < Kind.BY_SAG:
-            continue
-        functions: SagFunctions = kernels_of(kind, "cuda")
-        forms.add(shape_of(kind, functions))
-        further = functions.extras(row, own)
-        if further is not None:
-            row[Code.EXTRAS] = len(device_extras)
-            device_extras += further
+        if kind >= Kind.BY_SAG:
+            forms.add(shape_of(kind, kernels_of(kind, "cuda")))
     table = torch.tensor(rows, dtype=torch.int32).reshape(-1, Code.ROW)
     return DeviceCodes(
         table.to(device),
-        torch.tensor(device_extras, dtype=torch.int32).to(device),
+        own.to(device),
         table[:, Code.BEFORE].long().to(device),
         table[:, Code.AFTER].long().to(device),
         kinds,

@@ -1,16 +1,8 @@
 """A surface that is given by its sag has three Triton functions."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import triton.language as tl
-
-Row = list[int]
-
-
-def _as_they_are(row: Row, extras: Sequence[int]) -> list[int] | None:
-    """Keep the table's own extras."""
-    return None
 
 
 class SagFunctions(NamedTuple):
@@ -28,15 +20,12 @@ class SagFunctions(NamedTuple):
             of_sag·∂s/∂p + of_x·∂²s/∂x∂p + of_y·∂²s/∂y∂p; it returns nothing.
         starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
             starts; else it starts on the vertex plane.
-        extras: a function of the row of codes, which it may change, and of the table's extras; it
-            gives the integers that the device has in their place, or None for the table's own.
     """
 
     sag: Any
     sag_hessian: Any
     add_sums: Any
     starts_on_conic: bool = False
-    extras: Callable[[Row, Sequence[int]], list[int] | None] = _as_they_are
 
 
 class LawKernels(NamedTuple):

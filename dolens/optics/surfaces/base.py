@@ -55,10 +55,9 @@ class PackedShape(NamedTuple):
 
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
-        count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term; of other shapes what their kernel
-            says.
-        degree: highest power of x or y, or what the kernel says.
+        count: numbers of a series, or rows of a spline.
+        columns: of a spline or a grid, or numbers of a second series.
+        degree: rows of a grid, or what the kernel says.
         extras: further integers.
         data: so many numbers at the end are data, which have no cotangents.
     """
@@ -103,9 +102,17 @@ def packed_as(layout: Sequence[int | None], parts: Sequence[Any], **more: Any) -
 
 
 def everywhere(numbers: Sequence[Any], x: Tensor, y: Tensor) -> list[Tensor]:
-    """Return numbers at all points x, y, where some are the same everywhere, or are no tensors."""
-    zero = torch.zeros_like(x + y)
-    return [n if isinstance(n, Tensor) and n.dim() >= zero.dim() else zero + n for n in numbers]
+    """Return numbers of as many dimensions as the points x, y, where some are the same everywhere,
+    or are no tensors.
+    """
+    shape = torch.broadcast_shapes(x.shape, y.shape)
+
+    def full(n: Any) -> Tensor:
+        there = isinstance(n, Tensor) and n.dim() >= len(shape)
+        found: Tensor = n if there else x.new_zeros(shape) + n
+        return found
+
+    return [full(n) for n in numbers]
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:

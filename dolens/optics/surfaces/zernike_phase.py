@@ -206,7 +206,8 @@ class ZernikeFringePhase(ZernikePhase):
 class ZernikeStandardPhase(ZernikePhase):
     """The polynomials are in Noll's order with unit variance over the disc ("standard").
 
-    They end with the radial order 12, beyond which monomials lose too many digits.
+    They end with the radial order 12, beyond which the monomials of paraxial properties lose too
+    many digits.
     """
 
     type: ClassVar[str] = "zernike_standard"  # type: ignore[assignment]
