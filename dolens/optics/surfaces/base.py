@@ -105,7 +105,8 @@ def everywhere(numbers: Sequence[Any], x: Tensor, y: Tensor) -> list[Tensor]:
     """Return numbers of as many dimensions as the points x, y, where some are the same everywhere,
     or are no tensors.
     """
-    shape = torch.broadcast_shapes(x.shape, y.shape)
+    # Not torch.broadcast_shapes, whose first call imports SymPy: half a second.
+    shape = torch.broadcast_tensors(x, y)[0].shape
 
     def full(n: Any) -> Tensor:
         there = isinstance(n, Tensor) and n.dim() >= len(shape)
