@@ -15,6 +15,7 @@ from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import point_spread
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.prescriptions import lens_from_prescription
 from tests.diffraction.perfect_lenses import N, hyperbola, relay
 
@@ -52,6 +53,19 @@ def test_airy_s_pattern_and_its_sampling_error(rays):
     assert 0.0 < float(found.sampling_error) < 1e-3
     assert float(found.strehl_ratio) == pytest.approx(1.0, abs=1e-4)
     assert found.diffraction == (True,)
+
+
+@pytest.mark.parametrize("inner", [0.3, 0.6])
+def test_a_ring_s_pattern(inner):
+    """[2J₁(v)/v - ε²·2J₁(εv)/(εv)]²/(1 - ε²)² (Born and Wolf, 8.6.2)."""
+    stop = ClearAperture(Circle(1.0), Circle(inner))
+    found = huygens_point_spread(
+        hyperbola(100.0, stop), AXIS, [WAVELENGTH], cells=24, half_width_um=60.0
+    )
+    v = 2.0 * math.pi / LAMBDA / 100.0 * cells(found)
+    expected = ((jinc(v) - inner**2 * jinc(inner * v)) / (1.0 - inner**2)) ** 2
+    peak = 1e-6 * math.pi * (1.0 - inner**2) / (LAMBDA * 100.0) ** 2
+    np.testing.assert_allclose(found.irradiance[0].numpy() / peak, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("waves", [0.5, 1.6, 4.5])

@@ -155,30 +155,30 @@ def change_pose(lens):
         lens.elements["rear"].tilt_x += 0.01
 
 
+POSED = [change_aperture, change_material, change_gap, change_pose]  # of a lens with an element
 CHANGES = [exchange_parameter, exchange_surface, change_a_list_of_materials, change_data]
-CHANGES += [change_precision, rule_a_grating, drop_reversals, change_aperture, change_material]
-CHANGES += [change_gap, change_pose]
+CHANGES += [change_precision, rule_a_grating, drop_reversals, *POSED]
 
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_lens_is_traced_as_it_is_now(root, change):
-    lens = triplet(root) if change is not change_pose else tilted(root, torch.float64)
+    posed = change in POSED
+    lens = tilted(root, torch.float64) if posed else triplet(root)
+    lens.backend = "cpu"
+    names = ["surfaces.*.curvature", *["elements.rear.tilt_x"] * posed]
     before = lens.trace(bundle())
-    ray_jacobian(lens, bundle(), ["surfaces.*.curvature"])
+    ray_jacobian(lens, bundle(), names)
     change(lens)
-    found, moved = (
-        everything(lens, bundle()),
-        ray_jacobian(lens, bundle(), ["surfaces.*.curvature"]),
-    )
+    found, moved = everything(lens, bundle()), ray_jacobian(lens, bundle(), names)
     lens.backend = "reference"
-    expected = everything(lens, bundle())
-    slopes = ray_jacobian(lens, bundle(), ["surfaces.*.curvature"])
+    expected, slopes = everything(lens, bundle()), ray_jacobian(lens, bundle(), names)
     assert (moved.derivatives - slopes.derivatives).abs().max() < 1e-9
     different = (found[0] - before.position).abs().max() > 1e-3
     assert different or not torch.equal(found[3], before.status)
     assert torch.equal(found[3], expected[3])
     for a, b in zip(found[5:], expected[5:], strict=True):
-        assert torch.allclose(a, b, rtol=1e-8, atol=1e-9 * float(b.abs().max()))
+        # A sum over rays rounds by 1e-12; a tilt about a lens's own axis moves nothing else.
+        assert torch.allclose(a, b, rtol=1e-8, atol=1e-9 * float(b.abs().max()) + 1e-11)
     valid = found[3] == 0
     assert (found[0] - expected[0])[valid].abs().max() < 1e-11
 
