@@ -121,10 +121,12 @@ def two_epochs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     parent = tmp_path_factory.mktemp("two_epochs")
-    with composing(root, parent) as build:
-        objective = run(build(*CAMERA))
-    log.removeHandler(handler)
-    log.setLevel(level)
+    try:
+        with composing(root, parent) as build:
+            objective = run(build(*CAMERA))
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
     return Finished(parent / "run", objective, tuple(said))
 
 
