@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy
 import pytest
 import torch
+import yaml
 
 from dolens import Lens, load_lens
+from dolens.prescriptions import lens_from_prescription
 
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.
@@ -111,6 +113,14 @@ def triplet(root: Path, backend: str) -> Lens:
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     lens.backend = backend
     return lens
+
+
+@pytest.fixture
+def singlet(root: Path) -> Lens:
+    """A single lens whose pose is fitted."""
+    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
+    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
+    return lens_from_prescription(prescription).double().requires_grad_(False)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-import yaml
 
 from dolens import InputError
 from dolens.alignment.element_fit import (
@@ -20,20 +19,11 @@ from dolens.alignment.element_fit import (
 from dolens.alignment.moments import POWERS, Pixels
 from dolens.alignment.spot_moments import SENSOR, moment_model
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.prescriptions import lens_from_prescription
 
 FIELDS = ((0.0, 0.0), (0.0, 14.0), (-14.0, 0.0), (14.0, -6.0))
 ELEMENTS = ("front", "middle", "rear")
 HALF_RANGE = torch.tensor([math.radians(0.2)] * 2 + [0.05] * 2, dtype=torch.float64)
 PIXELS = Pixels(0.00345, read_noise=2.0, window=5.0)
-
-
-@pytest.fixture(scope="module")
-def triplet(root):
-    prescription = yaml.safe_load((root / "conf/lens/cooke_triplet.yaml").read_text())
-    spans = {"front": [1, 2], "middle": [3, 4], "rear": [5, 6]}
-    prescription["elements"] = {name: {"surfaces": span} for name, span in spans.items()}
-    return lens_from_prescription(prescription, torch.float64)
 
 
 @pytest.fixture(scope="module")

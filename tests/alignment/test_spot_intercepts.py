@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-import yaml
 from torch.func import jacfwd, vmap
 
 from dolens import InputError, Rays
@@ -20,7 +19,6 @@ from dolens.alignment.spot_moments import (
 )
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.optics import ray_tracing
-from dolens.prescriptions import lens_from_prescription
 
 FIELDS = ((0.0, 0.0), (0.0, 14.0), (14.0, -6.0))
 WAVELENGTHS = (656.2725, 587.5618, 486.1327)
@@ -31,14 +29,6 @@ NAMES = (
 # Rounding of an intercept 15 mm off the axis is 2e-15 mm, some 1e-12 of a spot's size; cubes have
 # three times that.
 ROUNDING, OF_MOMENTS = 1e-14, 5e-12
-
-
-@pytest.fixture(scope="module")
-def triplet(root):
-    prescription = yaml.safe_load((root / "conf/lens/cooke_triplet.yaml").read_text())
-    spans = {"front": [1, 2], "middle": [3, 4], "rear": [5, 6]}
-    prescription["elements"] = {name: {"surfaces": span} for name, span in spans.items()}
-    return lens_from_prescription(prescription, torch.float64)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import torch
 from scipy.integrate import dblquad, quad
 from scipy.special import j1
 
-from dolens import load_lens
 from dolens.diffraction import pixel_psf as wave_psf
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pixel_psf import (
@@ -37,22 +36,9 @@ DEPTHS = [8000.0, 6000.0, 4500.0]
 
 
 @pytest.fixture
-def coding(root):
-    """The wavefront-coding lens with its cubic plate, in a precision."""
-
-    def build(plate: float = 1.5e-5, dtype: torch.dtype = torch.float64):
-        lens = load_lens(root / "conf/lens/wavefront_coding.yaml", dtype=dtype)
-        with torch.no_grad():
-            lens.surfaces["5"].x3.fill_(plate)
-            lens.surfaces["5"].y3.fill_(plate)
-        return lens.requires_grad_(False)
-
-    return build
-
-
-@pytest.fixture
-def triplet(root):
-    return load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
+def coding(wavefront_coding):
+    """The wavefront-coding lens, with its cubic plate where no other strength is given."""
+    return lambda plate=1.5e-5, dtype=torch.float64: wavefront_coding(plate, dtype)
 
 
 def on_axis(depths: list[float]) -> list[list[float]]:

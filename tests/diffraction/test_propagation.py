@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import quad, simpson
 from scipy.special import j0, j1, jn_zeros
 
-from dolens import Lens, load_lens
+from dolens import Lens
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.propagation import direct_field, fourier_field
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
@@ -206,11 +206,6 @@ def test_energy_is_kept():
     # Cells on the edge keep the square of their share.
     assert float(kept) == pytest.approx(float(pupil.flux), rel=0.02)
     assert float(pupil.flux) == pytest.approx(1.0, abs=1e-3)
-
-
-@pytest.fixture
-def triplet(root):
-    return load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
 
 
 @pytest.mark.parametrize("radius", [None, math.inf, 30.0])

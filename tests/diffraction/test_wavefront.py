@@ -27,12 +27,6 @@ from tests.diffraction.perfect_lenses import (
     relay,
 )
 
-
-@pytest.fixture
-def triplet(root):
-    return load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
-
-
 AXIS = ObjectPoints.at_infinity([[0.0, 0.0]])
 CENTRE = [[0.0, 0.0]]
 

@@ -24,13 +24,6 @@ from dolens.lens_search.verification import Requirements
 from tests.lens_page.conftest import Page
 
 
-@pytest.fixture(scope="module")
-def triplet():
-    lens = load_lens("cooke_triplet").requires_grad_(False)
-    lens.wavelengths = (587.5618,)
-    return lens
-
-
 def test_the_usual_tolerances_make_a_lens_worse(triplet):
     found = lens_sensitivity(triplet)
     assert found.nominal_um < found.expected_um

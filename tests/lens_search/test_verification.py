@@ -20,13 +20,6 @@ FIELDS, RAYS = 3, 40
 
 
 @pytest.fixture(scope="module")
-def triplet():
-    lens = load_lens("cooke_triplet").requires_grad_(False)
-    lens.wavelengths = (587.5618,)
-    return lens
-
-
-@pytest.fixture(scope="module")
 def checked(triplet):
     required = Requirements(50.0, f_number=4.9, total_track=60.0, back_focus=40.0, vignetting=0.5)
     return verify(triplet, required, FIELDS, RAYS)

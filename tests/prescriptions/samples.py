@@ -1,5 +1,7 @@
 """A lens and a check that several tests of lens files share."""
 
+import copy
+
 import torch
 
 from dolens import load_lens
@@ -16,6 +18,14 @@ SINGLET = {
     },
     "sensor": {"distance": 30.0, "diameter": 10.0},
 }  # fmt: skip
+
+
+def with_row(n="1", **keys):
+    """The singlet with other keys in a surface's row; a key that is None is left out."""
+    data = copy.deepcopy(SINGLET)
+    row = data["surfaces"][n] | keys
+    data["surfaces"][n] = {key: value for key, value in row.items() if value is not None}
+    return data
 
 
 def require_refused(path, content, said):

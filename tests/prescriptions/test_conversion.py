@@ -1,6 +1,5 @@
 """A lens file in another format says the same lens, and every change is told."""
 
-import copy
 import math
 
 import pytest
@@ -12,16 +11,9 @@ from dolens.prescriptions import load_prescription
 from dolens.prescriptions.conversion import converted
 from dolens.prescriptions.files import decode_prescription
 from tests.lenses import prescription_of_rows
-from tests.prescriptions.samples import SINGLET, require_same_parameters
+from tests.prescriptions.samples import SINGLET, require_same_parameters, with_row
 from tests.prescriptions.zemax.samples import HEAD, TAIL, TRIPLET, standard, surface
 from tests.refused import refused
-
-
-def with_row(n="1", **keys):
-    data = copy.deepcopy(SINGLET)
-    row = data["surfaces"][n] | keys
-    data["surfaces"][n] = {key: value for key, value in row.items() if value is not None}
-    return data
 
 
 def zemax_triplet():

@@ -21,7 +21,7 @@ from dolens.prescriptions.plain_values import json_of
 from dolens.prescriptions.zemax.file import encode_zemax
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
-from tests.prescriptions.samples import SINGLET, require_same_parameters
+from tests.prescriptions.samples import SINGLET, require_same_parameters, with_row
 from tests.refused import refused
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
@@ -230,13 +230,6 @@ def with_aperture(data, write, suffix):
             write(data)
     shape = {key: value for key, value in row.items() if key not in ("radius", "curvature")}
     data["surfaces"][str(n + 1)] = shape | {"type": "aperture"}
-    return data
-
-
-def with_row(n="1", **keys):
-    data = copy.deepcopy(SINGLET)
-    row = data["surfaces"][n] | keys
-    data["surfaces"][n] = {key: value for key, value in row.items() if value is not None}
     return data
 
 

@@ -4,24 +4,15 @@ import math
 
 import pytest
 import torch
-import yaml
 from torch.func import jvp
 
 from dolens.errors import InputError
-from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.psf import bin_rays
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
 SENSOR = Sensor(48, 40, 0.1)
 NAMES = ("tilt_x", "tilt_y", "decenter_x", "decenter_y", "shift_z")
-
-
-@pytest.fixture
-def singlet(root):
-    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
-    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
-    return lens_from_prescription(prescription).double().requires_grad_(False)
 
 
 def posed(lens, values):

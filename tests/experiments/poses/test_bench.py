@@ -4,24 +4,15 @@ import copy
 
 import pytest
 import torch
-import yaml
 
 from dolens.alignment.measurement import Light
 from dolens.errors import InputError
 from dolens.experiments.poses.bench import Bench, Observations, draw, light_of, simulate
 from dolens.experiments.poses.fit_plan import fit_plan
-from dolens.prescriptions import lens_from_prescription
 from dolens.sensor.pixels import Sensor
 
 BENCH = Bench(622.5, Sensor(32, 32, 0.15), [[0.0, 0.0, -864.0]])
 TILT, DISTANCE = "elements.lens.tilt_x", "sensor_distance"
-
-
-@pytest.fixture
-def singlet(root):
-    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
-    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
-    return lens_from_prescription(prescription).double().requires_grad_(False)
 
 
 def plan(fits):
