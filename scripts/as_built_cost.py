@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.made_lenses import restored_in_parts, training_images
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.training import build_lens
+from dolens.experiments.running.training import build_module
 from scripts.composed import composed
 
 ARMS = (0, 1, 2, 4)
@@ -39,7 +39,7 @@ def step_of(overrides: list[str], lenses: int) -> Callable[[], None]:
     """
     arm = ["as_built.train=false"] if lenses == 0 else [f"as_built.lenses_per_step={lenses}"]
     with composed([*overrides, *arm]) as cfg:
-        camera: Any = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+        camera: Any = build_module(RunSettings.of(cfg))
         data: Any = instantiate(cfg.data)
     data.setup("fit")
     batch = next(iter(data.train_dataloader()))

@@ -17,7 +17,7 @@ from dolens.experiments.camera.reconstruction import loss_over_views
 from dolens.experiments.camera.views.base import seed_of
 from dolens.experiments.data.camera_data import CropDataModule
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.training import build_lens
+from dolens.experiments.running.training import build_module
 from dolens.reconstruction import (
     FeatureWienerRestoration,
     Restoration,
@@ -88,7 +88,7 @@ def fixed_optics(file: Path, overrides: Sequence[str], training: bool = True) ->
         training: whether training and validation images are made too, or test images alone.
     """
     with composed(overrides) as cfg:
-        camera = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
+        camera = build_module(RunSettings.of(cfg))
         data = instantiate(cfg.data)
     if not file.is_file():
         data.setup(None)

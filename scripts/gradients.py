@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.training import build_lens
+from dolens.experiments.running.training import build_module
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, load_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
@@ -152,10 +151,9 @@ def training_losses() -> Iterator[tuple[str, Lens, Loss, list[str]]]:
     """Title, lens, loss, and the names of the experiment's own variables."""
     for name, overrides in _EXPERIMENTS.items():
         with composed([f"experiment={name}", *overrides]) as cfg:
-            lens = build_lens(RunSettings.of(cfg))
-            module = instantiate(cfg.module)(lens=lens).double()
+            module: Any = build_module(RunSettings.of(cfg)).double()
         module.eval()  # no statistics that move from call to call
-        yield f"{name}, its training loss", lens, _loss(module), list(module.variables.names)
+        yield f"{name}, its training loss", module.lens, _loss(module), list(module.variables.names)
 
 
 def _loss(module: torch.nn.Module) -> Loss:

@@ -93,7 +93,8 @@ def test_networks_restore_and_learn_there(kind):
     network = RESTORERS[kind]().to("cuda")
     raw = raw_image().float().to("cuda").requires_grad_()
     restored = network(raw, blur().float().to("cuda"))
-    assert {g.device.type for g in torch.autograd.grad(restored.sum(), [raw])} == {"cuda"}
+    gradients = torch.autograd.grad(restored.sum(), [raw, *network.parameters()])
+    assert {g.device.type for g in gradients} == {"cuda"}
 
 
 @pytest.mark.parametrize("kind", [GeneralRestoration, WienerTVRestoration])
