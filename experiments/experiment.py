@@ -59,7 +59,9 @@ class Experiment(lightning.LightningModule):
         self.lens = lens.requires_grad_(False)
 
     def place(self, experiment: str, folder: Path | None) -> None:
-        """Say which run this is the work of; a run does so before anything else.
+        """Say which run this is the work of; a run does so once the module is made.
+
+        `__init__` does not know it: there `experiment` is empty and `folder` is None.
 
         Args:
             experiment: the name of the experiment.

@@ -56,7 +56,7 @@ class Evaluation:
 
     @torch.no_grad()
     def measure(self, camera: Camera, batch: Tensor, stage: str, index: int) -> None:
-        """Image, restore and compare textures (B, 3, h, w); see `Imaging.take` for the others."""
+        """Image, restore and compare textures (B, 3, h, w); see `Shot` for the others."""
         values = camera.variables()
         for reference in (None, *camera.views.reference_renderers()):
             started, shot = time.perf_counter(), Shot(batch, stage, index, reference)

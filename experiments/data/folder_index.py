@@ -236,21 +236,18 @@ class IndexFile:
             raise InputError(
                 f"{self.folder}: no images in this folder; allowed: files ending in {endings}"
             )
-        count = len(names)
-        index = FolderIndex(
-            self.folder,
-            PackedNames.of(names),
-            np.full(count, UNSEEN, dtype=np.uint8),
-            *(np.zeros(count, dtype=np.int64) for _ in range(2)),
-        )
-        known = 0
-        if before is not None:
-            numbers = {name: number for number, name in enumerate(before.names)}
-            origin = np.array([numbers.get(name, -1) for name in names], dtype=np.int64)
-            still = origin >= 0
-            known = int(still.sum())
-            for name in _KNOWN:
-                getattr(index, name)[still] = getattr(before, name)[origin[still]]
+        count, packed = len(names), PackedNames.of(names)
+        if before is not None and np.array_equal(before.names.text, packed.text):
+            index, known = before, count
+        else:
+            index, known = self._unseen(packed), 0
+            if before is not None:
+                numbers = {name: number for number, name in enumerate(before.names)}
+                origin = np.array([numbers.get(name, -1) for name in names], dtype=np.int64)
+                still = origin >= 0
+                known = int(still.sum())
+                for name in _KNOWN:
+                    getattr(index, name)[still] = getattr(before, name)[origin[still]]
         if known or count >= LEAST:
             seconds = time.perf_counter() - started
             _log.info(
@@ -259,6 +256,16 @@ class IndexFile:
                 *(self.folder, count, folders, known, seconds),
             )
         return index
+
+    def _unseen(self, names: PackedNames) -> FolderIndex:
+        """Return an index that knows nothing of the files."""
+        count = len(names)
+        return FolderIndex(
+            self.folder,
+            names,
+            np.full(count, UNSEEN, dtype=np.uint8),
+            *(np.zeros(count, dtype=np.int64) for _ in range(2)),
+        )
 
     def keep(self, index: FolderIndex) -> None:
         """Write an index for the next start; where that fails, one line says so."""

@@ -48,7 +48,6 @@ class LensSearchModule(Analysis):
     """Searches for lenses, and checks and writes the best of each form.
 
     Args:
-        folder: where tables and lenses go.
         specification: of the lens.
         plan: how much is searched.
         forms: how many of the best forms are checked and written.
@@ -242,7 +241,8 @@ class KeptSteps:
         if plain["digest"] != self._digest:
             raise InputError(
                 f"{path.parent}: holds steps of a search with another specification or plan, or "
-                "with other glasses; remove the folder, or choose another run folder"
+                "with other glasses, or by another version of dolens; remove the folder, or choose "
+                "another run folder"
             )
         self.seconds_before = max(self.seconds_before, float(plain["seconds"]))
         step = plain["step"]

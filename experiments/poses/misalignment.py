@@ -222,8 +222,9 @@ class MisalignmentModule(Experiment):
                         self.log_dict(spread_metrics(*spread))
                     rows = spread_columns(rows, *spread[1:])
                 self.results += rows
-        write_table(self.folder / "history.csv", self.history)
-        write_table(self.folder / "poses.csv", self.results)
+        if self.folder is not None:
+            write_table(self.folder / "history.csv", self.history)
+            write_table(self.folder / "poses.csv", self.results)
         for row in self.results:
             logger.info(
                 "%s %s: true %.5g, initial %.5g, found %.5g, error %.2g, bound %.2g (%.2g if all "

@@ -46,7 +46,7 @@ def page(material: Material) -> str:
         "gain_sentence": gain_sentence,
         "prose": lambda text: Markup(prose(text)),
         "size_of": size_of,
-        "style": lambda name: name.lower().replace("_", "-"),
+        "style": _style,
     }
     results = material.results
 
@@ -158,12 +158,17 @@ _BADGES = {
 }
 
 
+def _style(state: State) -> str:
+    """Return the name of a state in the rules of the page."""
+    return state.name.lower().replace("_", "-")
+
+
 def _badge(material: Material, item: Item) -> tuple[str, str]:
     """Return what is said beside an item's title, and its style."""
     states = {outcome.state for outcome in material.outcomes_of(item.item)}
     for state, words in _BADGES.items():
         if state in states:
-            return words, state.name.lower().replace("_", "-")
+            return words, _style(state)
     return "shown, no check" if item.runs else "held by tests", "quiet"
 
 

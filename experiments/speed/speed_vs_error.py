@@ -125,7 +125,6 @@ class SpeedVsErrorModule(Analysis):
 
     Args:
         lens: the lens of the run; it is not used.
-        folder: where the table goes.
         scenes: name → settings of `subject_of`.
         parts: of `trace`, `psf` and `render`.
         contenders: the ways of rendering.

@@ -15,8 +15,10 @@ from typing import Any
 from hydra.core.utils import JobReturn
 
 from dolens.errors import InputError, check_choice, one_line
+from dolens.experiments.running.process_settings import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.workers.ray_cluster import joined_cluster, local_cluster
+from dolens.threads import allowed_processors
 
 logger = logging.getLogger(__name__)
 
@@ -173,6 +175,7 @@ def _reason(error: BaseException) -> str:
 
 
 _LOOK_AT_SUBMISSIONS_S = 0.2
+_MINUTES = {"slurm": 60, "local": 1440}
 _LINES = 2
 
 
@@ -182,23 +185,26 @@ def in_slurm_jobs(
     cluster: str = "slurm",
     array_parallelism: int = 256,
     max_num_timeout: int = 0,
+    timeout_min: int | None = None,
     **parameters: Any,
 ) -> Iterator[tuple[SweepJob, JobReturn]]:
-    """Run jobs as one array of Slurm's.
+    """Run jobs as one array of Slurm's; or on this machine, to try a sweep before it goes there.
 
     Args:
         jobs: to run.
         folder: of submitit's files, that all nodes see.
-        cluster: `slurm`, or `local`: all jobs at once on this machine, to try a sweep before it
-            goes to Slurm.
-        array_parallelism: so many at once.
+        cluster: `slurm`, or `local`: in processes that share the cores of this machine, as many at
+            once as there are cores for.
+        array_parallelism: so many at once, and no more.
         max_num_timeout: so often a job that ran out of its time is queued again, to go on from its
             last checkpoint.
-        parameters: submitit's own, as `timeout_min`, `cpus_per_task`, `gpus_per_node`, `mem_gb`,
+        timeout_min: minutes until a job is ended; None: 60 on Slurm, 1440 on this machine.
+        parameters: submitit's own, as `cpus_per_task`, `gpus_per_node`, `mem_gb`,
             and those that it calls `slurm_…` without that word; those that are null are left out.
 
     Raises:
-        InputError: submitit is not installed, there is no Slurm here, or a parameter is unknown.
+        InputError: submitit is not installed, there is no Slurm here, a parameter is unknown, or
+            its value is not allowed.
     """
     if not jobs:
         return
@@ -209,25 +215,49 @@ def in_slurm_jobs(
             "hydra/launcher=submitit_slurm: the package 'submitit' is not installed; "
             "pip install 'dolens[slurm]'"
         ) from None
-    common = ("timeout_min", "cpus_per_task", "gpus_per_node", "mem_gb", "nodes", "name")
+    common = ("cpus_per_task", "gpus_per_node", "mem_gb", "nodes", "name")
     given = {
         name if name in common else f"slurm_{name}": value
         for name, value in parameters.items()
         if value is not None
     }
-    check_choice(cluster, ("slurm", "local"), "hydra.launcher.cluster")
+    check_choice(cluster, tuple(_MINUTES), "hydra.launcher.cluster")
+    minutes = _MINUTES[cluster] if timeout_min is None else timeout_min
     try:
         executor = submitit.AutoExecutor(
             folder, cluster=cluster, slurm_max_num_timeout=max_num_timeout
         )
-        executor.update_parameters(**given, slurm_array_parallelism=array_parallelism)
+        executor.update_parameters(
+            **given, timeout_min=minutes, slurm_array_parallelism=array_parallelism
+        )
     except (RuntimeError, NameError, TypeError, ValueError) as error:
         raise InputError(f"hydra/launcher=submitit_slurm: {one_line(error)}") from None
+    if cluster == "local":
+        yield from _shared_out(jobs, executor, array_parallelism)
+        return
     with executor.batch():
         submitted = [(job, executor.submit(Elsewhere(job))) for job in jobs]
     logger.info("%d jobs of Slurm: %s", len(jobs), ", ".join(one.job_id for _, one in submitted))
     while submitted:
         yield from _ended(submitted)
+
+
+def _shared_out(
+    jobs: Sequence[SweepJob], executor: Any, most: int
+) -> Iterator[tuple[SweepJob, JobReturn]]:
+    """Run jobs by an executor of this machine, so that jobs at once times threads are its cores."""
+    if type(most) is not int or most < 1:
+        raise InputError(f"hydra.launcher.array_parallelism: {most!r}; allowed: a number of jobs")
+    cores = allowed_processors()
+    share = share_of(jobs, min(most, max(1, cores // (given_threads(jobs) or 1))), cores)
+    waiting = deque(jobs)
+    running: list[tuple[SweepJob, Any]] = []
+    while waiting or running:
+        while waiting and len(running) < share.jobs:
+            job = waiting.popleft()
+            with environment_variables(share.environment()):
+                running.append((job, executor.submit(Elsewhere(job))))
+        yield from _ended(running)
 
 
 def _ended(running: list[tuple[SweepJob, Any]]) -> Iterator[tuple[SweepJob, JobReturn]]:

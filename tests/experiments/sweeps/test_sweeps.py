@@ -70,6 +70,38 @@ def test_a_failed_job_and_a_killed_one_leave_the_others(tmp_path, launcher, monk
     assert list((tmp_path / "home").iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("cores", "options", "threads"),
+    [(3, ["hydra.launcher.array_parallelism=1"], 3), (1, [], 1)],
+    ids=["as many as asked", "as many as there are cores for"],
+)
+def test_jobs_that_are_tried_for_slurm_share_this_machine(
+    tmp_path, monkeypatch, cores, options, threads
+):
+    submitit = pytest.importorskip("submitit")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(launchers, "allowed_processors", lambda: cores)
+    said: list[str] = []
+    monkeypatch.setattr(launchers.logger, "info", lambda text, *of: said.append(text % of))
+    given, update = [], submitit.AutoExecutor.update_parameters
+    monkeypatch.setattr(
+        submitit.AutoExecutor,
+        "update_parameters",
+        lambda self, **options: given.append(options) or update(self, **options),
+    )
+    options = ["hydra.launcher.cluster=local", *options]
+    assert sweep(tmp_path, "submitit_slurm", ["value=1", "value=2"], *options) == [1.0, 2.0]
+    assert [begun(tmp_path, job) for job in (0, 1)] == [[f"MULTIRUN {threads} None"]] * 2
+    # The second one began when the first had ended.
+    first, second = (tmp_path / "jobs" / job for job in "01")
+    assert (first / "metrics.json").stat().st_mtime_ns < (second / "begun").stat().st_mtime_ns
+    assert given[0]["timeout_min"] == 24 * 60
+    assert said == [f"2 jobs, 1 at once, of {threads} thread{'s' if threads > 1 else ''} each"]
+    assert "OMP_NUM_THREADS" not in os.environ
+    with pytest.raises(InputError, match=r"array_parallelism: 0; allowed"):
+        list(in_slurm_jobs([Job()], str(tmp_path), cluster="local", array_parallelism=0))
+
+
 def told_of_kill(reason: str) -> bool:
     return any(word in reason for word in ("was killed", "has not produced any output"))
 
