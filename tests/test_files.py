@@ -84,6 +84,25 @@ def test_what_is_no_file_is_refused_in_one_line_and_at_once(reader, unreadable):
     assert str(caught.value).isprintable()
 
 
+def test_elements_that_a_file_of_tolerances_gives_are_refused_with_its_name(tmp_path):
+    file = tmp_path / "tolerances.yaml"
+    file.write_text("elements: {far: {surfaces: [1, 99]}}\ntolerances: {}\n")
+    with pytest.raises(InputError, match=r"tolerances\.yaml: element far: surface 99 is not in"):
+        read_tolerance_file(load_lens("asphere"), file)
+
+
+def test_elements_of_a_file_of_tolerances_join_those_of_the_lens_which_stay(tmp_path):
+    file, lens = tmp_path / "tolerances.yaml", load_lens("cooke_triplet")
+    lens.elements["front"] = Element(1, 2, {"tilt_x": 0.01})
+    file.write_text("elements: {front: {surfaces: [1, 2]}, rear: {surfaces: [5, 6]}}\n")
+    drawn, _, _ = read_tolerance_file(lens, file)
+    assert set(drawn.elements) == {"front", "rear"} and set(lens.elements) == {"front"}
+    assert float(drawn.elements["front"].tilt_x.detach()) == 0.01
+    file.write_text("elements: {front: {surfaces: [1, 4]}}\n")
+    with pytest.raises(InputError, match=r"yaml: element front has surfaces 1 to 2 in the lens"):
+        read_tolerance_file(lens, file)
+
+
 def test_a_glass_catalogue_that_is_no_file_is_refused(unreadable):
     path, said = unreadable(".agf")
     if path.is_dir() if path.name == "lens.agf" else False:

@@ -35,6 +35,9 @@ from dolens.lens_page.overview import lens_overview, prepared_lens
 lens.chief_ray((0.0, 10.0))
 assert not loaded("sympy", "torch._dynamo", "matplotlib")
 assert not loaded("dolens.prescriptions.zemax", "dolens.prescriptions.codev")
+# Nor do elements of glass.
+import dolens.manufacturing.glass_elements
+assert not loaded("dolens.plotting", "matplotlib")
 from dolens.plotting import layout_figure
 layout_figure(lens)
 assert not loaded("numba")

@@ -1,6 +1,5 @@
 """Images of point sources: measured, read from photographs, or simulated photon by photon."""
 
-import copy
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -159,15 +158,16 @@ def simulated(
     effects, photons = light.unmodelled, int(light.photons)
     diameter = effects.source_diameter
     images = []
-    moved = [copy.deepcopy(lens) for _ in planes]
+    moved = [lens.storing_its_values() for _ in planes]
     for one, plane in zip(moved, planes, strict=True):
         one.sensor_distance.add_(plane)
     for source, one in itertools.product(sources.double(), moved):
         image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
-        places = _by_rays(one, source, wavelength, photons, diameter, generator)
         if effects.diffraction:
             fine = diffracted_light(one, source, wavelength, sensor, diameter)
             places = iter([fine.photons(photons, diameter, generator)])
+        else:
+            places = _by_rays(one, source, wavelength, photons, diameter, generator)
         for x, y in places:
             rows, columns = (p.round() for p in sensor.pixels(x, y))
             inside = (

@@ -1,6 +1,5 @@
 """Effects of a real measurement that the model of a pose fit has not, diffraction among them."""
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -77,7 +76,7 @@ class Unmodelled:
             lens: as designed; it stays as it is.
             generator: on the CPU.
         """
-        found = copy.deepcopy(lens)
+        found = lens.storing_its_values()
         glasses = [m for m in dict.fromkeys(lens.materials) if is_glass(m)]
         count = len(found.surfaces) + len(glasses)
         shares = 2.0 * torch.rand(count, generator=generator, dtype=torch.float64) - 1.0

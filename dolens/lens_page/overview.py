@@ -1,6 +1,5 @@
 """The overview of a lens at conditions of one's own: the tables of a page and of a terminal."""
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -154,7 +153,8 @@ def prepared_lens(
     Raises:
         InputError: a field, wavelength or aperture out of range, or two apertures.
     """
-    lens = copy.deepcopy(lens).to(device="cpu", dtype=torch.float64).requires_grad_(False)
+    lens = lens.storing_its_values().to(device="cpu", dtype=torch.float64)
+    lens.requires_grad_(False)
     if wavelengths is not None:
         waves = as_wavelengths(wavelengths).tolist()
         if len(set(waves)) < len(waves):

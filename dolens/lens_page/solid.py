@@ -22,7 +22,6 @@ from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse
 from dolens.optics.surfaces.obscurations import Ring, Spider, Together
 from dolens.optics.surfaces.outlines import Point, Polygons
 from dolens.optics.system import OpticalSystem
-from dolens.plotting.section import place_of
 
 AZIMUTHS = 64
 _ACROSS = 10
@@ -211,7 +210,7 @@ def _placed(system: OpticalSystem, number: int, x: np.ndarray, y: np.ndarray) ->
 
 def _turned(system: OpticalSystem, number: int, vectors: np.ndarray, moved: bool) -> np.ndarray:
     """Return points (moved) or directions in a surface's axes in those of the lens."""
-    rotation, origin = (part.numpy() for part in place_of(system, number))
+    rotation, origin = (part.numpy() for part in system.place(number))
     turned = vectors @ rotation.T
     return turned + origin if moved else turned
 

@@ -1,6 +1,5 @@
 """Real beams of the whole field are traced through a found lens, and measured on every surface."""
 
-import copy
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -167,7 +166,7 @@ def with_drawn_heights(lens: Lens, heights: Tensor) -> Lens:
         lens: stays as it is.
         heights: (S,), mm, of the beams on its surfaces; NaN leaves a surface as it is.
     """
-    drawn = copy.deepcopy(lens).requires_grad_(False)
+    drawn = lens.storing_its_values().requires_grad_(False)
     for surface, height in zip(drawn.surfaces.values(), heights.tolist(), strict=True):
         if not surface.aperture.clips and height > 0.0:
             size = min(_MARGIN * height, surface.reach)

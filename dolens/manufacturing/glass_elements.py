@@ -7,21 +7,19 @@ symmetry goes on as its own sag to the edge.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
-from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Rectangle
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, require_refracting
-from dolens.plotting.section import place_of
 
 # Lengths that differ by less than this (mm) are the same to a workshop and to a solid modeller.
 SAME_LENGTH = 1e-6
@@ -36,19 +34,30 @@ class Face:
 
     Attributes:
         number: of the surface in the lens, from 1.
-        shape: the class of the surface, a namespace of pure functions.
-        parameters: name → tensor.
-        aperture: what light passes.
+        surface: its parameters without gradients, on the CPU.
         rotation: (3, 3); a point p in the surface's axes lies at origin + rotation·p in the lens's.
         origin: (3,), mm, the vertex.
     """
 
     number: int
-    shape: type[Surface]
-    parameters: Mapping[str, Tensor]
-    aperture: ClearAperture
+    surface: SurfaceState
     rotation: np.ndarray
     origin: np.ndarray
+
+    @property
+    def shape(self) -> type[Surface]:
+        """Return the class of the surface, a namespace of pure functions."""
+        return self.surface.shape
+
+    @property
+    def parameters(self) -> Parameters:
+        """Return the parameters of the surface by name."""
+        return self.surface.parameters
+
+    @property
+    def aperture(self) -> ClearAperture:
+        """Return what light passes."""
+        return self.surface.aperture
 
     @property
     def semi_diameter(self) -> float:
@@ -71,8 +80,7 @@ class Face:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the sag (mm), its slopes, and whether the sag branch exists; all are finite."""
         points = (torch.as_tensor(v, dtype=torch.float64) for v in np.broadcast_arrays(x, y))
-        surface = SurfaceState(self.shape, self.parameters, self.aperture)
-        sag, sx, sy, exists = surface.sag_and_slopes(*points)
+        sag, sx, sy, exists = self.surface.sag_and_slopes(*points)
         return sag.numpy(), sx.numpy(), sy.numpy(), exists.numpy()
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -264,9 +272,9 @@ def glass_elements(lens: Lens) -> list[GlassElement]:
 def face_of(system: OpticalSystem, number: int) -> Face:
     """Return a surface of a system as a face, in double precision and where it lies."""
     surface = system.surfaces[number - 1]
-    rotation, origin = (part.numpy() for part in place_of(system, number))
+    rotation, origin = (part.numpy() for part in system.place(number))
     parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
-    return Face(number, surface.shape, parameters, surface.aperture, rotation, origin)
+    return Face(number, replace(surface, parameters=parameters), rotation, origin)
 
 
 def _label(groups: Mapping[tuple[int, int], str], number: int) -> str:

@@ -80,7 +80,7 @@ def heights_of_pupil_angles(lens: Lens, angles: Tensor) -> Tensor:
 
 def in_double_precision(lens: Lens) -> Lens:
     """Return the lens in double precision: itself, if it is."""
-    return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)
+    return lens if lens.dtype == torch.float64 else lens.storing_its_values().to(torch.float64)
 
 
 def _of_real_rays(lens: Lens, heights: Tensor) -> Tensor:
@@ -207,7 +207,7 @@ def with_aperture(
     ((name, target),) = given.items()
     if not (target > 0.0 and math.isfinite(target)):
         raise InputError(f"{name} must be positive, not {target}")
-    lens = copy.deepcopy(lens)
+    lens = lens.storing_its_values()
     exact = copy.deepcopy(lens).to(torch.float64)
     first = exact.first_order(lens.primary_wavelength, meridian="y")
     diameter = abs(float(first.efl)) / target if name == "f_number" else target

@@ -3,7 +3,7 @@
 import copy
 import difflib
 import fnmatch
-from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
+from collections.abc import Callable, ItemsView, Iterator, Mapping, Sequence, ValuesView
 from pkgutil import resolve_name
 from types import MethodType
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
@@ -230,6 +230,31 @@ class Lens(LensRays, InStates, nn.Module):
         found = copy.copy(self)
         found.given = {}
         return found
+
+    @torch.no_grad()
+    def storing_its_values(self) -> Self:
+        """Return a copy of this lens that stores the values that `with_values` gave it.
+
+        It shares nothing with this lens, and no gradient flows to the values.  What no lens stores,
+        as an index offset, the copy is still given.
+
+        Raises:
+            InputError: a semi-diameter of an aperture that is no circle.
+        """
+        found, given = copy.deepcopy(self.as_stored()), dict(self.given)
+        for name, stored in (*found.named_parameters(), *found.named_buffers()):
+            if name in given:
+                stored.copy_(given.pop(name))
+        for number, surface in found.surfaces.items():
+            edge = given.pop(f"surfaces.{number}.semi_diameter", None)
+            if edge is not None:
+                surface.aperture = surface.aperture.resized(float(edge))
+        return found.with_values({name: value.detach().clone() for name, value in given.items()})
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Convert or move the given values with the parameters: `to`, `double`, `cpu`."""
+        self.given = {name: fn(value) for name, value in self.given.items()}
+        return super()._apply(fn, recurse)
 
     def _system(self, values: dict[str, Tensor]) -> OpticalSystem:
         """Return the lens as pure functions see it; what is used of `values` is taken out."""

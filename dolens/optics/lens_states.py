@@ -114,12 +114,12 @@ class InStates:
         of this lens no longer, and have no gradient; `values_there` gives them with their graph.
 
         Args:
-            name: of the state; None returns this lens itself.
+            name: of the state; None returns this lens itself, without given values of states.
 
         Raises:
             InputError: there is no such state; the message lists those that there are.
         """
-        return self if name is None else in_state(self, name)
+        return in_state(self, name)
 
 
 def check_state(lens: Any, name: str) -> None:
@@ -132,11 +132,13 @@ def check_state(lens: Any, name: str) -> None:
         )
 
 
-def in_state(lens: Any, name: str) -> Any:
+def in_state(lens: Any, name: str | None) -> Any:
     """Return a lens in a state; see `Lens.in_state`."""
     if lens.given:
         there = values_there(lens.as_stored(), name, lens.given)
         return in_state(lens.as_stored(), name).with_values(there)
+    if name is None:
+        return lens
     found, data = overlaid(lens, name), lens.states[name].data
     if data.temperature is None and data.pressure is None:
         return found
@@ -184,6 +186,7 @@ def at_temperature(lens: Any, temperature: float, pressure: float | None = None)
     """Return a copy of a lens at another temperature and pressure, in all its states; see
     `lens_at`.
     """
+    lens = lens.storing_its_values() if lens.given else lens
     found = lens_at(lens, temperature, pressure)
     for name in lens.state_names:
         hot, state = lens_at(overlaid(lens, name), temperature, pressure), found.states[name]

@@ -175,6 +175,13 @@ class OpticalSystem:
         rotations, origins = (torch.stack(part) for part in zip(*places, strict=True))
         return GlobalAxes(origins, rotations)
 
+    def place(self, number: int) -> tuple[Tensor, Tensor]:
+        """Return rotation (3, 3) and origin (3,), mm, of a surface's axes in the lens's: a point p
+        there lies at origin + rotation·p.  They are without gradients, on the CPU.
+        """
+        rotation, origin = self.axes[number - 1].place(self.device)
+        return rotation.detach().cpu(), origin.detach().cpu()
+
     @property
     def dtype(self) -> torch.dtype:
         """The precision that rays are traced in."""

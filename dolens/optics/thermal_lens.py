@@ -8,7 +8,6 @@ the mount where it touches the lenses, at the edges of their clear apertures:
 with the sags s at the edges of the surfaces before and behind it.
 """
 
-import copy
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -72,14 +71,15 @@ def lens_at(lens: Any, temperature: float, pressure: float | None = None) -> Any
     if pressure is None:
         pressure = STANDARD_PRESSURE if lens.pressure is None else lens.pressure
     environment = Environment(float(temperature), float(pressure))
-    found = copy.deepcopy(lens)
+    found = lens.storing_its_values()
+    hot = expanded_values(found, temperature)
+    factors = _factors(found, temperature - _temperature(found))
     found.temperature, found.pressure = environment.temperature, environment.pressure
     found.materials = tuple(medium_at(medium, environment) for medium in lens.materials)
     _log_unknown(lens, media_of(lens.materials).materials)
-    for name, value in expanded_values(lens, temperature).items():
+    for name, value in hot.items():
         found.get_parameter(name).copy_(value)
-    change = temperature - _temperature(lens)
-    for surface, factor in zip(found.surfaces.values(), _factors(lens, change), strict=True):
+    for surface, factor in zip(found.surfaces.values(), factors, strict=True):
         _expand_unvaried(surface, factor)
     return found
 

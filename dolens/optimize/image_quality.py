@@ -27,16 +27,20 @@ SPECTRA = ("monochromatic", "polychromatic")
 
 
 def without_edges(lens: Lens) -> Lens:
-    """Return a lens whose apertures clip nothing, with the very parameters of this one.
+    """Return a lens whose apertures clip nothing, with the very parameters and values of this one.
 
     A search for a better lens follows the same rays all the way: one that slips out of an aperture
     would otherwise leave its spot, and make it smaller.
     """
     shared = {id(tensor): tensor for tensor in (*lens.parameters(), *lens.buffers())}
-    opened = copy.deepcopy(lens, shared)
-    for surface in opened.surfaces.values():
-        surface.aperture = surface.aperture.opened()
-    return opened
+    opened, given = copy.deepcopy(lens.as_stored(), shared), dict(lens.given)
+    for number, surface in opened.surfaces.items():
+        edge = given.pop(f"surfaces.{number}.semi_diameter", None)
+        aperture = surface.aperture
+        if edge is not None:
+            aperture = aperture.resized(float(edge.detach()))
+        surface.aperture = aperture.opened()
+    return opened.with_values(given)
 
 
 @dataclass(frozen=True)

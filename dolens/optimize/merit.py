@@ -1,6 +1,5 @@
 """The merit function of a design gives its spots and its operands as residuals of least squares."""
 
-import copy
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -71,7 +70,7 @@ class MeritFunction:
         quality: ImageQuality | None,
         operands: Sequence[Operand] = (),
     ) -> None:
-        self.lens = copy.deepcopy(lens)
+        self.lens = lens.storing_its_values()
         self.opened = without_edges(self.lens)
         self.variables, self.quality, self.operands = variables, quality, tuple(operands)
         if variables.best_focus and (quality is None or not quality.focusable):

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
-from dolens.optics.lens_states import values_there
 from dolens.optics.parameter_names import STATES, split_state, to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
 
@@ -82,11 +81,10 @@ class FocalLength:
         """Return the curvature c for which P(c) = 1/EFL, 1/mm."""
         stored = lens.get_parameter(self.name).detach()
         state, _ = split_state(self.name)
-        there = lens.as_stored().in_state(state)
 
         def power(curvature: float) -> Tensor:
-            trial = {**lens.given, self.name: stored.new_tensor(curvature)}
-            system = there.system(values_there(lens, state, trial))
+            trial = lens.with_values({self.name: stored.new_tensor(curvature)})
+            system = trial.in_state(state).system()
             return -surface_matrix(system, self.wavelength, 1, len(system.surfaces))[1, 0]
 
         flat = power(0.0)
@@ -111,8 +109,7 @@ class ParaxialFocus:
     def value(self, lens: Lens) -> Tensor:
         """Return the distance of the sensor from the last vertex, mm."""
         state, _ = split_state(self.name)
-        given = {n: v for n, v in lens.given.items() if n != self.name}
-        system = lens.as_stored().in_state(state).system(values_there(lens, state, given))
+        system = lens.in_state(state).system()
         image = first_order(system, self.wavelength, self.object_distance).image
         return image - system.vertices[len(system.surfaces) - 1] + self.defocus
 

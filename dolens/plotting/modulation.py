@@ -81,8 +81,10 @@ def modulation_figure(
     return figure
 
 
-def _draw(axes: Axes, mtf: Curves, names: Sequence[str] | None = None) -> dict[int, str]:
-    """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
+def _draw(axes: Axes, mtf: Curves, names: Sequence[str] | None = None) -> dict[int, list[str]]:
+    """Draw one lens; return labels of the fields that share a curve, by the number of the field
+    that is drawn.
+    """
     frequency = mtf.frequencies.numpy()
     limit: dict[str, Any] = {
         "color": "black",
@@ -121,7 +123,7 @@ def _draw(axes: Axes, mtf: Curves, names: Sequence[str] | None = None) -> dict[i
     axes.set(xlim=(frequency.min(), frequency.max()), ylim=(0.0, 1.02))
     axes.set_xlabel("frequency (cycles/mm)", fontsize=SMALL + 1)
     ruled_axes(axes)
-    return {number: ", ".join(found) for number, found in labels.items()}
+    return labels
 
 
 def _alike(mtf: Curves, one: int, other: int) -> bool:
@@ -129,15 +131,12 @@ def _alike(mtf: Curves, one: int, other: int) -> bool:
     return all(torch.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in pairs)
 
 
-def _agreed(labels: list[dict[int, str]]) -> dict[int, str]:
+def _agreed(labels: list[dict[int, list[str]]]) -> dict[int, str]:
     """Return the labels of a legend that is right for all panels."""
     if all(found == labels[0] for found in labels):
-        return labels[0]
+        return {number: ", ".join(shared) for number, shared in labels[0].items()}
     # Where panels join other fields, each field has its own entry; a curve may hide another.
-    every = {number: text for found in labels for number, text in found.items()}
-    return {
-        number: text.split(",")[0] if "(" not in text else text for number, text in every.items()
-    }
+    return {number: shared[0] for found in labels for number, shared in found.items()}
 
 
 def modulation_comparison_figure(

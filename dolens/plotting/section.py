@@ -35,7 +35,7 @@ class SurfaceCut:
 
     def __init__(self, system: OpticalSystem, number: int) -> None:
         self.surface = system.surfaces[number - 1]
-        self.rotation, self.origin = place_of(system, number)
+        self.rotation, self.origin = system.place(number)
         # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
         ax, ay, self.az = self.rotation[0]
         self.offset = self.origin[0]
@@ -93,12 +93,6 @@ def runs(inside: Callable[[Tensor], Tensor], reach: float) -> list[tuple[float, 
         low, high = torch.where(same, half, low), torch.where(same, high, half)
     rims = torch.where(first, low, high).tolist()
     return list(zip(rims[::2], rims[1::2], strict=False))
-
-
-def place_of(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
-    """Return rotation (3, 3) and origin (3,), mm, of a surface's axes, on the CPU."""
-    rotation, origin = system.axes[number - 1].place(system.device)
-    return rotation.detach().cpu(), origin.detach().cpu()
 
 
 # The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
@@ -172,7 +166,7 @@ def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
 
 def axis_angle(system: OpticalSystem, number: int) -> float:
     """Return the angle (radians) from z towards y of a surface's axis, seen along x."""
-    rotation, _ = place_of(system, number)
+    rotation, _ = system.place(number)
     return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
 
 

@@ -1,6 +1,5 @@
 """Small sections of many lenses are drawn side by side: forms of a lens, sheets of lenses."""
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -122,7 +121,7 @@ def _fitted(lens: Lens, paths: list[np.ndarray]) -> Lens:
     lit = [rays for rays in paths if len(rays)]
     if not lit or not lens.system().rotationally_symmetric:
         return lens
-    fitted = copy.deepcopy(lens)
+    fitted = lens.storing_its_values()
     heights = np.max([np.abs(rays[:, 1:-1, 1]).max(0) for rays in lit], 0)
     for height, surface in zip(heights, fitted.surfaces.values(), strict=True):
         if not surface.aperture.clips and height > 0.0:

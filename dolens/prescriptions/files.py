@@ -1,6 +1,5 @@
 """Lens files are read, written, and checked by the folder."""
 
-import copy
 import logging
 import os
 import re
@@ -172,11 +171,12 @@ def read_tolerance_file(
     An experiment's file does as well: its `lens.elements` and `tolerances` are read.
 
     Returns:
-        A copy of the lens with the file's elements; what the file says; and keys of an experiment
-        that are not read.
+        A copy of the lens with the file's elements besides its own, which stay where they are;
+        what the file says; and keys of an experiment that are not read.
 
     Raises:
-        InputError: one line that names the file and the key.
+        InputError: one line that names the file and the key; or an element of the lens has other
+            surfaces in the file.
     """
     content = read_yaml_file(path, "file of tolerances", "--tolerances")
     require_mapping(content, str(path))
@@ -188,10 +188,18 @@ def read_tolerance_file(
         unread = [str(key) for key in content if key not in (*_TOLERANCE_KEYS, "defaults", "lens")]
     else:
         check_keys(content, _TOLERANCE_KEYS, str(path))
-    lens = copy.deepcopy(lens).requires_grad_(True)
+    lens = lens.storing_its_values().requires_grad_(True)
     for name, element in elements_from(elements, lens.dtype, str(path)).items():
-        lens.elements[name] = element
-    check_elements(dict(lens.elements.items()), len(lens.surfaces))
+        own = lens.elements[name] if name in lens.elements else element
+        if (own.first, own.last) != (element.first, element.last):
+            raise InputError(
+                f"{path}: element {name} has surfaces {own.first} to {own.last} in the lens"
+            )
+        lens.elements[name] = own
+    try:
+        check_elements(dict(lens.elements.items()), len(lens.surfaces))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return lens, content, unread
 
 

@@ -5,7 +5,6 @@ four nodes a cell that is imaged by itself.  So memory does not grow with the pi
 picture and its image themselves.
 """
 
-import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -92,7 +91,7 @@ class WholeField:
             InputError: a lens that renderers refuse, a depth inside it, chief rays of the sensor's
                 outer pixels that do not pass it, or blur that is too wide.
         """
-        single, double = (copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64))
+        single, double = (lens.storing_its_values().to(d) for d in (torch.float32, torch.float64))
         scene.check(double.system())
         exact, fast = (
             ImagingSystem.of(with_chosen_backend(one.system()), scene, sensor)

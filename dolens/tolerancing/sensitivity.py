@@ -2,7 +2,6 @@
 mean effect of all, and spots through focus what a compensator wins back.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -152,7 +151,7 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
     check_whole_pupil(spots)
     require_plane_sensor(lens.system(), "tolerances")
     # Rays are straight behind the lens: their points on a second sensor give the tangents exactly.
-    behind = copy.deepcopy(lens)
+    behind = lens.storing_its_values()
     with torch.no_grad():
         behind.sensor_distance.add_(1.0)
     points = _points(lens, spots, names)

@@ -6,7 +6,6 @@ thick, and curvatures 0.1 % too strong.  Of a small lens all lengths are less: 0
 clear diameter.  All are uniform over ± the half-range.
 """
 
-import copy
 import difflib
 import fnmatch
 import math
@@ -217,7 +216,7 @@ def with_glass_elements(lens: Lens) -> Lens:
     Args:
         lens: stays as it is.
     """
-    lens = copy.deepcopy(lens).requires_grad_(True)
+    lens = lens.storing_its_values().requires_grad_(True)
     taken = {n for e in lens.elements.values() for n in range(e.first, e.last + 1)}
     glass = [is_glass(medium) for medium in lens.materials]
     first = None

@@ -14,7 +14,6 @@ from dolens.analysis.pupil_quadrature import joined_spots, with_chief_rays
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
-from dolens.optics.parameter_names import values_in_state
 from dolens.optimize import DampedLeastSquares
 from dolens.optimize.deconvolved_error import DeconvolvedError, Photographs
 from dolens.optimize.merit import MeritFunction
@@ -64,8 +63,7 @@ class CameraOperands:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        alone = lens.as_stored().with_values(values_in_state(lens, None, lens.given))
-        found = evaluate_operands(self.entries, alone, self.object_distance)
+        found = evaluate_operands(self.entries, lens.in_state(None), self.object_distance)
         total = torch.zeros((), device=lens.device)
         for penalty in found.penalties():
             total = total + penalty

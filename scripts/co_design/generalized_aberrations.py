@@ -17,6 +17,7 @@ the spots' centroids; as many of them count as rays were drawn.
 """
 
 import math
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import lightning
@@ -96,7 +97,7 @@ class GeneralizedAberrations(lightning.Callback):
         self.increase, self.decrease, self.memory = increase, decrease, memory
         self.taken = 0
         self._found: list[_Rays] = []
-        self._watching = watched_points(self._cut)
+        self._watching = ExitStack()
         self._batch: tuple[Tensor, int] | None = None
         self._loss, self._columns = math.nan, None
 
@@ -112,13 +113,17 @@ class GeneralizedAberrations(lightning.Callback):
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         """Begin to watch where rays meet the scene, and keep the graph from there to the lens."""
-        self._watching.__enter__()
+        self._watching.enter_context(watched_points(self._cut))
         pl_module.backward = lambda loss, *_, **__: loss.backward(retain_graph=True)
+        self._watching.callback(delattr, pl_module, "backward")
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         """Watch no longer."""
-        self._watching.__exit__(None, None, None)
-        del pl_module.backward
+        self._watching.close()
+
+    def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
+        """Watch no longer: a training that fails has no end."""
+        self._watching.close()
 
     def on_train_batch_start(
         self, trainer: Any, pl_module: Any, batch: Tensor, batch_idx: int

@@ -3,10 +3,9 @@
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
-from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.analysis.pupil_quadrature import SpotRays, gaussian_rings
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
@@ -101,12 +100,11 @@ def beams(lens: Lens, design: Design, rings: int = _RINGS, arms: int = _ARMS) ->
         rings: radii of Gaussian quadrature; 1 is the rim alone.
         arms: of the whole pupil, even; one half stands for both.
     """
-    nodes, shares = np.polynomial.legendre.leggauss(rings)
-    radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0))) if rings > 1 else torch.ones(1).double()
+    radii, shares = gaussian_rings(rings, rim=rings == 1)
     angle = (torch.arange(arms // 2).double() + 0.5) * (2.0 * math.pi / arms) - 0.5 * math.pi
     unit = torch.stack((angle.cos(), angle.sin()), -1)
     disc = (radii[:, None, None] * unit).reshape(-1, 2)
-    weight = torch.from_numpy(0.5 * shares)[:, None].expand(-1, arms // 2).reshape(-1)
+    weight = shares[:, None].expand(-1, arms // 2).reshape(-1)
     weight = weight / weight.sum()
     width = pupil_of(lens, design)
     place = float(lens.first_order(design.wavelength).entrance_pupil.z)

@@ -160,3 +160,24 @@ def landing_of(lens, values):
 def test_a_state_that_there_is_not_is_answered_with_those_that_there_are(lens):
     with pytest.raises(InputError, match=r"no state 'tale'; did you mean 'tele'.*wide, tele, near"):
         lens.in_state("tale")
+
+
+def test_a_lens_with_values_is_hot_with_them_in_all_its_states(lens):
+    values = {
+        "surfaces.4.curvature": torch.tensor(0.02, dtype=torch.float64, requires_grad=True) * 1.0,
+        OWN: torch.tensor(13.0, dtype=torch.float64),
+    }
+    stored = copy.deepcopy(lens)
+    with torch.no_grad():
+        for name, value in values.items():
+            stored.get_parameter(name).copy_(value)
+    found, expected = lens.with_values(values).at(80.0), stored.at(80.0)
+    for name in (None, "wide", "tele"):
+        assert torch.equal(landing(found.in_state(name)), landing(expected.in_state(name)))
+
+
+def test_a_lens_in_none_of_its_states_has_no_values_of_theirs(lens):
+    values = {"surfaces.4.curvature": torch.tensor(0.02).double(), OWN: torch.tensor(13.0).double()}
+    alone = lens.with_values(values).in_state(None)
+    assert set(alone.given) == {"surfaces.4.curvature"}
+    assert torch.equal(landing(alone), landing(lens.with_values(alone.given)))

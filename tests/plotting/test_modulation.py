@@ -47,3 +47,18 @@ def test_fields_on_both_sides_of_a_lens_share_their_entry_and_have_a_minus(tripl
     labels = legend(figure)
     assert labels[:2] == ["0°", "(14, 0)°, (−14, 0)°"]
     assert not flaws(figure)
+
+
+def test_each_field_has_one_entry_where_panels_join_other_fields():
+    frequency = torch.linspace(0.0, 50.0, 6).double()
+    curve, limit = torch.linspace(1.0, 0.5, 6).double(), torch.linspace(1.0, 0.9, 6)
+
+    def panel(scales):
+        curves = curve * torch.tensor(scales).double()[:, None]
+        return Modulation(FIELDS[:2], "°", LINES, frequency, curves, curves, limit)
+
+    panels = {"apart": panel([1.0, 0.8]), "alike": panel([1.0, 1.0])}
+    figure = modulation_figure(panels, labels=["0°", "14° (rays alone)"])
+    assert legend(figure)[:3] == ["0°", "14° (rays alone)", "tangential"]
+    figure = modulation_figure({"one": panels["alike"], "two": panels["alike"]})
+    assert legend(figure)[:2] == ["0°, 14°", "tangential"]

@@ -22,7 +22,6 @@ from dolens.rendering.auto.probes import (
     probe_texture,
     reference,
 )
-from dolens.rendering.auto.trial import storing_its_values
 from dolens.rendering.exit_pupil import ExitPupil
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -262,7 +261,7 @@ def test_a_plan_is_made_for_the_stop_as_it_is_varied(root):
     lens, scene = coded(root), PlanarScene((6000.0,), LINES)
     radius = torch.tensor(0.5 * lens.surfaces["1"].semi_diameter, dtype=lens.dtype)
     values = {"surfaces.1.semi_diameter": radius, "surfaces.5.x3": torch.zeros_like(radius)}
-    smaller = storing_its_values(lens.with_values(values))
+    smaller = lens.with_values(values).storing_its_values()
     assert smaller.surfaces["1"].semi_diameter == float(radius)
     assert lens.surfaces["1"].semi_diameter == pytest.approx(2.0 * float(radius))
     auto = AutoRenderer(Sensor(16, 16, 0.0069), 4.0, gradients=False, diffraction=False)

@@ -6,6 +6,7 @@ The residuals of a loss have its value and its gradient, wherever the points wan
 import pytest
 import torch
 
+from dolens.rendering.psf_grid import _watch
 from scripts.co_design.cases import CASES, METHODS, THEIRS, candidates
 from scripts.co_design.generalized_aberrations import GeneralizedAberrations, residuals
 from scripts.co_design.results import against, gains, summary, table
@@ -92,6 +93,20 @@ def test_a_lens_moves_by_these_residuals():
     assert callback.taken == 3
     assert bool((module.variables.scaled != before).all())
     assert module.lens_steps.least_squares.taken == 0
+
+
+def test_a_training_that_fails_leaves_nothing_watched_and_another_can_follow():
+    callback, module = GeneralizedAberrations(), torch.nn.Module()
+    for end in (
+        lambda: callback.on_exception(None, module, KeyboardInterrupt()),
+        lambda: callback.on_train_end(None, module),
+    ):
+        callback.on_train_start(None, module)
+        assert "backward" in vars(module) and _watch.get() == callback._cut
+        end()
+        assert "backward" not in vars(module) and _watch.get() is None
+    # It may fail before it begins.
+    GeneralizedAberrations().on_exception(None, module, ValueError())
 
 
 def test_the_best_of_ours_counts_against_theirs():

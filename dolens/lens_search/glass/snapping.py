@@ -42,14 +42,12 @@ class Snapped:
         fixed: the same before glasses were exchanged.
         continuous: the lenses at the start, optimised with continuous glasses.
         several: the best few of each lens, different in their glasses, the best first.
-        trials: how many lenses were optimised.
     """
 
     designs: Designs
     fixed: Designs
     continuous: Designs
     several: Designs
-    trials: int
 
 
 def snap_glasses(
@@ -89,7 +87,7 @@ def snap_glasses(
         for lens, row in zip(start.lens.tolist(), start.numbers >= 0, strict=True)
     }
     final = exchanged(work, designs, held)
-    return Snapped(_in_order(final), _in_order(designs), _in_order(continuous), final, work.count)
+    return Snapped(_in_order(final), _in_order(designs), _in_order(continuous), final)
 
 
 def _in_order(designs: Designs) -> Designs:

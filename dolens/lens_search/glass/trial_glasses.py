@@ -187,11 +187,10 @@ class SnapSettings:
 
 
 class TrialGlasses:
-    """Makes trials of a set of real glasses, has them optimised, and counts them.
+    """Makes trials of a set of real glasses, and has them optimised.
 
     Attributes:
         settings: how many trials are made.
-        count: of lenses optimised so far.
     """
 
     def __init__(
@@ -206,14 +205,12 @@ class TrialGlasses:
         self._reoptimise = reoptimise
         self.settings = settings
         self._cost = torch.zeros_like(glasses[:, 0]) if cost is None else cost.to(glasses)
-        self.count = 0
 
     def optimised(self, trials: GlassTrials) -> Designs:
         """Return the trials after optimisation, without those that failed."""
         if len(trials.lens) == 0:
             nothing = trials.variables.new_zeros(0)
             return Designs(trials, nothing, nothing, nothing)
-        self.count += len(trials.lens)
         merit, variables, coordinates, model = self._reoptimise(trials)
         held = trials.numbers >= 0
         coordinates = torch.where(held[..., None], trials.coordinates, coordinates)

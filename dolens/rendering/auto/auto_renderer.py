@@ -1,6 +1,5 @@
 """The renderer that chooses its model, for a whole sensor or for windows of a large one."""
 
-import copy
 import logging
 import math
 import time
@@ -254,6 +253,6 @@ class AutoRenderer(Renderer):
         """Go on with a plan that was made before; this renderer takes it up."""
         if state:
             self.choice = Choice.from_state(state, self.sensor, lens.dtype, self.tolerance)
-            self._cast = copy.deepcopy(lens).requires_grad_(False).to(self.choice.dtype)
+            self._cast = lens.storing_its_values().requires_grad_(False).to(self.choice.dtype)
             logger.info("renderer auto: the plan of the checkpoint is taken up")
         return self

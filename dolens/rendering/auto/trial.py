@@ -77,7 +77,7 @@ class Trial:
         self.probes, self.requirements = probes, requirements
         self.scene, self.separate_planes = as_planes(scene), scene.separate_planes
         values = lens.given if requirements.gradients else {}
-        lens = storing_its_values(lens)
+        lens = lens.storing_its_values()
         self._single, self._double = (
             copy.deepcopy(lens).to(dtype) for dtype in (torch.float32, torch.float64)
         )
@@ -214,16 +214,3 @@ class Trial:
     def _placed(self, window: SensorWindow) -> PlanarScene:
         """The scene with its textures at the object points of a window."""
         return replace(self.scene, texture_centre=window.texture_centre)
-
-
-def storing_its_values(lens: Lens) -> Lens:
-    """Return a copy of a lens that stores the values that it was given, semi-diameters too."""
-    changed = copy.deepcopy(lens.as_stored())
-    parameters = dict(changed.named_parameters())
-    for name, value in lens.given.items():
-        if name in parameters:
-            parameters[name].copy_(value)
-            continue
-        surface = changed.surfaces[name.split(".")[1]]
-        surface.aperture = surface.aperture.resized(float(value.detach()))
-    return changed

@@ -22,19 +22,17 @@ def glasses():
 @pytest.mark.parametrize("count", [2, 3])
 def test_the_snapped_achromat_and_apochromat_are_within_a_percent_of_the_best(glasses, count):
     best = thin.all_merits(glasses, count)[0].min()
-    calls = []
     found = snap_glasses(
         thin.start(glasses, count, lenses=2, seed=3),
         glasses.coordinates,
-        thin.reoptimise(glasses, calls, iterations=25),
+        thin.reoptimise(glasses, iterations=25),
     )
     numbers = found.designs.trials.numbers
     assert (numbers >= 0).all()
     torch.testing.assert_close(thin.merit(glasses.indices[numbers]), found.designs.merit)
     assert (found.designs.merit < 1.01 * best).all()
-    # Exchanges only help, and all that was optimised is counted.
+    # Exchanges only help.
     assert (found.designs.merit <= found.fixed.merit).all()
-    assert found.trials == sum(len(trials.lens) for trials in calls)
 
 
 def test_costs_decide_between_glasses_that_are_nearly_as_good(glasses):
