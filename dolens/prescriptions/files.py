@@ -190,7 +190,7 @@ def read_tolerance_file(
         check_keys(content, _TOLERANCE_KEYS, str(path))
     lens = lens.storing_its_values().requires_grad_(True)
     for name, element in elements_from(elements, lens.dtype, str(path)).items():
-        own = lens.elements[name] if name in lens.elements else element
+        own = lens.elements.get(name, element)
         if (own.first, own.last) != (element.first, element.last):
             raise InputError(
                 f"{path}: element {name} has surfaces {own.first} to {own.last} in the lens"
