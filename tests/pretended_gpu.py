@@ -147,6 +147,9 @@ class _Data(TorchFunctionMode):
         kwargs = dict(kwargs or {})
         if func is Tensor.new_tensor and isinstance(args[0], OnGpu):
             return torch.tensor(args[1], **{"dtype": args[0].dtype, "device": GPU, **kwargs})
+        if func is Tensor.__getitem__ and isinstance(args[1], list):
+            # Of a list PyTorch would make a tensor without numbers.
+            return args[0][torch.tensor(args[1])]
         if func in _DATA and isinstance(args[0], OnGpu):
             data = args[0].detach() if func is torch.tensor else args[0]
             return data.to(**{k: v for k, v in kwargs.items() if k in ("dtype", "device")})
@@ -163,10 +166,11 @@ class PretendedGpu(TorchDispatchMode):
 
     def __enter__(self) -> "PretendedGpu":
         torch._C._ensureCUDADeviceGuardSet()
-        self._before = torch._C._only_lift_cpu_tensors(), torch.cuda._lazy_init, torch.Generator
+        self._before = torch._C._only_lift_cpu_tensors(), torch.Generator
+        self._cuda = torch.cuda._lazy_init, torch.cuda.current_device
         self._overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
         torch._C._set_only_lift_cpu_tensors(True)
-        torch.cuda._lazy_init = lambda: None
+        torch.cuda._lazy_init, torch.cuda.current_device = lambda: None, lambda: 0
         torch.Generator = Generator
         torch.__future__.set_overwrite_module_params_on_conversion(True)
         self._data = _Data()
@@ -176,6 +180,7 @@ class PretendedGpu(TorchDispatchMode):
     def __exit__(self, *raised: Any) -> None:
         super().__exit__(*raised)
         self._data.__exit__(*raised)
-        lifts, torch.cuda._lazy_init, torch.Generator = self._before
+        lifts, torch.Generator = self._before
+        torch.cuda._lazy_init, torch.cuda.current_device = self._cuda
         torch._C._set_only_lift_cpu_tensors(lifts)
         torch.__future__.set_overwrite_module_params_on_conversion(self._overwrites)

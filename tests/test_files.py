@@ -16,8 +16,8 @@ from dolens.cli.app import app
 from dolens.experiments.data.package_photographs import read_manifest
 from dolens.experiments.lens_search.rungs import forms_of_run
 from dolens.files import packaged_configuration, read_file, written_whole
-from dolens.optics.glass_catalog import find_glass, glass_folders
 from dolens.optics.elements import Element
+from dolens.optics.glass_catalog import find_glass, glass_folders
 from dolens.prescriptions.files import check_file, read_tolerance_file
 
 UNREADABLE = {

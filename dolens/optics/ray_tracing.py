@@ -5,10 +5,10 @@ GPUs.
 """
 
 import logging
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from itertools import chain, zip_longest
 
 import torch
@@ -211,8 +211,6 @@ logger = logging.getLogger("dolens.kernels")
 BACKENDS = ("auto", "reference", "cpu", "cuda")
 # Rays times surfaces below which a lens of backend `auto` is traced without kernels; see `is_few`.
 FEW = 2048
-# Before, its compiler fails on functions in tuples, or stumbles over them.
-_TRITON = (3, 9)
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
@@ -358,17 +356,7 @@ def _transformed(tensors: Iterable[Tensor]) -> bool:
 @cache
 def without_triton() -> str | None:
     """Return why Triton cannot compile the kernels; None where it can."""
-    from importlib.util import find_spec
-
-    if find_spec("triton") is None:
-        return "triton is not installed"
-    import triton
-
-    found = tuple(int(part) for part in re.findall(r"\d+", triton.__version__)[:2])
-    if found < _TRITON:
-        least = ".".join(map(str, _TRITON))
-        return f"triton is {triton.__version__}; allowed: {least} or later, as with PyTorch 2.15"
-    return None
+    return None if find_spec("triton") is not None else "triton is not installed"
 
 
 @cache

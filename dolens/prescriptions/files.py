@@ -189,8 +189,9 @@ def read_tolerance_file(
     else:
         check_keys(content, _TOLERANCE_KEYS, str(path))
     lens = lens.storing_its_values().requires_grad_(True)
+    before = dict(lens.elements.items())
     for name, element in elements_from(elements, lens.dtype, str(path)).items():
-        own = lens.elements.get(name, element)
+        own = before.get(name, element)
         if (own.first, own.last) != (element.first, element.last):
             raise InputError(
                 f"{path}: element {name} has surfaces {own.first} to {own.last} in the lens"

@@ -297,7 +297,9 @@ def restored_by_rivals(
         functions = functions if own is None else own
     if functions is None:
         functions = camera.views.point_spread_functions(lens)
-    rivals = {name: _MADE[name]() for name in rival_names(camera.views.sensor)}
+    rivals = {
+        name: _MADE[name]().to(taken.given.device) for name in rival_names(camera.views.sensor)
+    }
     noise = torch.tensor(camera.views.noise)
     return {
         name: rival(taken.given, functions, None, noise).unflatten(0, taken.raw.shape[:2])

@@ -41,15 +41,6 @@ def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
     assert " passed" in run.stdout
 
 
-@pytest.mark.parametrize(("version", "said"), [("3.5.0", "triton is 3.5.0"), ("3.10.0", None)])
-def test_a_triton_that_cannot_compile_the_kernels_is_named(version, said, monkeypatch):
-    import triton
-
-    monkeypatch.setattr(triton, "__version__", version)
-    lack = without_triton.__wrapped__()
-    assert lack is None if said is None else lack.startswith(f"{said}; allowed: 3.9")
-
-
 @compiled
 def test_rays_on_the_cpu_are_refused(root):
     from dolens.kernels.cuda import backend

@@ -1,5 +1,7 @@
 """A surface that is given by its sag has three Triton functions."""
 
+import hashlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import triton.language as tl
@@ -50,24 +52,28 @@ class LawKernels(NamedTuple):
 
 # A law as the kernels take it: its code, its functions, and a digest of these.
 LAW_CODE, LAW_FORWARD, LAW_ADJOINT = (tl.constexpr(place) for place in range(3))
-LawShape = tuple[int, Any, Any, str]
+LawShape = tuple[int, Any, Any, int]
 
 
 def law_of(code: int, functions: LawKernels) -> LawShape:
     """Return a law's code and functions as the kernels take them."""
-    digest = "".join(getattr(function, "cache_key", "") for function in functions)
-    return (code, *functions, digest)
+    return (code, *functions, _digest(functions))
 
 
 # A shape as the kernels take it, a tuple of constants: its code and its functions, and at last a
 # digest of these, since Triton's cache on disk goes by the names of functions in a tuple.
 CODE, SAG, HESSIAN, SUMS, ON_CONIC = (tl.constexpr(place) for place in range(5))
-Shape = tuple[int, Any, Any, Any, bool, str]
+Shape = tuple[int, Any, Any, Any, bool, int]
 
 
 def shape_of(code: int, functions: SagFunctions) -> Shape:
     """Return a surface's code and functions as the kernels take them."""
     three = functions[:3]
-    # Triton's interpreter has no digests.
-    digest = "".join(getattr(function, "cache_key", "") for function in three)
-    return (code, *three, functions.starts_on_conic, digest)
+    return (code, *three, functions.starts_on_conic, _digest(three))
+
+
+def _digest(functions: Sequence[Any]) -> int:
+    """Return a number that changes with the functions' sources; Triton before 3.9 takes no text."""
+    # Triton's interpreter has no keys.
+    keys = "".join(getattr(function, "cache_key", "") for function in functions)
+    return int.from_bytes(hashlib.sha256(keys.encode()).digest()[:7])

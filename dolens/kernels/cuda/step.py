@@ -102,7 +102,7 @@ def intersect(
     for k in tl.static_range(len(FORMS)):
         if kind == FORMS[k][CODE]:
             t, nx, ny, nz, met = explicit_intersect(
-                record, codes, extras, x, y, l, m, n, sense, limit, scale, FORMS[k]
+                record, codes, extras, x, y, l, m, n, sense, limit, scale, FORMS, k
             )
     return t, nx, ny, nz, met
 
@@ -214,8 +214,9 @@ def step(
 
 @triton.jit
 def explicit_intersect(
-    record, codes, extras, x, y, l, m, n, sense, limit, scale, FORM: tl.constexpr
-):
+    record, codes, extras, x, y, l, m, n, sense, limit, scale,
+    FORMS: tl.constexpr, form: tl.constexpr,
+):  # fmt: skip
     """Return the distance from the vertex plane, the unit normal there, and whether it is met.
 
     As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after
@@ -226,7 +227,7 @@ def explicit_intersect(
     closest = 2.0**-45.5 if x.dtype == tl.float64 else 2.0**-20.125
     rounding = 2.0**-46 if x.dtype == tl.float64 else 2.0**-17
     t = tl.zeros_like(x)
-    if FORM[ON_CONIC]:
+    if FORMS[form][ON_CONIC]:
         c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
         start, squared = conic_distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
         t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
@@ -234,17 +235,17 @@ def explicit_intersect(
     steps = tl.full((), 0, tl.int32)
     most = tl.full((), MAX_STEPS, tl.int32)
     while (moving > 0) & (steps < most):
-        sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+        sag, sx, sy, _ = FORMS[form][SAG](record, codes, extras, x + l * t, y + m * t)
         change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
         change = clamp(change, scale)
         t = t - change
         moves = tl.abs(change) > close * (tl.abs(t) + scale)
         moving = tl.max(moves.to(tl.int32), 0)
         steps += 1
-        if FORM[ON_CONIC]:
+        if FORMS[form][ON_CONIC]:
             if ((moving == 0) | (steps == most)) & (most == MAX_STEPS):
                 # Rays that end at no root that counts begin once more, on the vertex plane.
-                sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+                sag, sx, sy, _ = FORMS[form][SAG](record, codes, extras, x + l * t, y + m * t)
                 slope = l * sx + m * sy - n
                 reach = tl.abs(slope) * (tl.abs(t) + scale)
                 counts = (sense * slope < 0.0) & (tl.abs(sag - n * t) <= close * reach)
@@ -254,17 +255,16 @@ def explicit_intersect(
                 most = steps + MAX_STEPS
     # Rays along a tangent are not there yet: they take some steps more.  Where the loop went on to
     # its end, those that converge have done so long before.
-    sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
-    moving, steps = 1 - moving, tl.full((), 0, tl.int32)
-    while (moving > 0) & (steps < MORE_STEPS):
+    sag, sx, sy, margin = FORMS[form][SAG](record, codes, extras, x + l * t, y + m * t)
+    moving = 1 - moving
+    for _ in range(MORE_STEPS):
         residual, slope = sag - n * t, l * sx + m * sy - n
         reach = tl.abs(slope) * (tl.abs(t) + scale)
         again = (tl.abs(residual) > closest * reach) & (tl.abs(residual) <= close * reach)
-        t = tl.where(again, t - divide(residual, away_from_zero(slope)), t)
-        moving = tl.max(again.to(tl.int32), 0)
+        moving *= tl.max(again.to(tl.int32), 0)
         if moving > 0:
-            sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
-        steps += 1
+            t = tl.where(again, t - divide(residual, away_from_zero(slope)), t)
+            sag, sx, sy, margin = FORMS[form][SAG](record, codes, extras, x + l * t, y + m * t)
     residual = sag - n * t
     slope = l * sx + m * sy - n
     steep = tl.where(tl.abs(slope) > 1.0, tl.abs(slope), 1.0)
@@ -279,9 +279,9 @@ def explicit_intersect(
 
 
 @triton.jit
-def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
+def _explicit_gradient(record, codes, extras, x, y, FORMS: tl.constexpr, form: tl.constexpr):
     """Return g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
-    sx, sy, sxx, sxy, syy = FORM[HESSIAN](record, codes, extras, x, y)
+    sx, sy, sxx, sxy, syy = FORMS[form][HESSIAN](record, codes, extras, x, y)
     gz = 1.0 + tl.zeros_like(x)
     inverse = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
     return -sx, -sy, gz, inverse, -sxx, -sxy, -syy, tl.zeros_like(x)
@@ -308,7 +308,7 @@ def surface_gradient(
     for k in tl.static_range(len(FORMS)):
         if kind == FORMS[k][CODE]:
             gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
-                record, codes, extras, x, y, FORMS[k]
+                record, codes, extras, x, y, FORMS, k
             )
     return gx, gy, gz, inverse, xx, xy, yy, zz
 

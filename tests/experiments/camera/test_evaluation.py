@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from dolens.experiments.camera.calibration import NoisyMeasurement, OtherDepth, OtherSample
+from dolens.optics import ray_tracing
 from dolens.rendering.psf import axial_point_spread_functions
 from tests.experiments.tiny_experiment import CAMERA, ONE_EPOCH, UNPICTURED
+from tests.pretended_gpu import PretendedGpu
 
 JUDGED = [*CAMERA, ONE_EPOCH, UNPICTURED, "reference_renderers=wave", "miscalibrations=wrong"]
 KINDS = ("depth", "tolerances", "noise")
@@ -106,3 +108,25 @@ def test_the_network_s_functions_have_a_perfect_pupil_s_diffraction_where_asked(
     x = torch.arange(33.0) - 16.0
     square = x[:, None] ** 2 + x[None, :] ** 2
     assert bool(((blurred * square).sum((-2, -1)) > (sharp * square).sum((-2, -1))).all())
+
+
+def test_a_camera_is_scored_on_a_gpu_as_on_the_cpu(made, monkeypatch):
+    """Its network, by rays and waves, with wrong calibrations, and its untrained rivals."""
+    monkeypatch.setattr(ray_tracing, "without_triton", lambda: "the GPU is pretended")
+
+    def scored(device):
+        torch.manual_seed(0)
+        camera = made(*JUDGED).to(device)
+        camera.views.prepare(camera.lens)
+        batch = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+        camera.evaluation.measure(camera, batch.to(device), "test", 0)
+        rows = camera.evaluation._rows.items()
+        return {(stage, name): found[0] for stage, row in rows for name, found in row.items()}
+
+    expected = scored("cpu")
+    with PretendedGpu():
+        found = scored("cuda")
+    assert {("test", "tv_psnr_db"), ("test_wave", "psnr_db")} < set(expected)
+    assert found.keys() == expected.keys()
+    for name, scores in expected.items():
+        assert torch.allclose(found[name], scores, atol=1e-3), name
