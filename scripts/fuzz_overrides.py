@@ -35,7 +35,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.errors import InputError, one_line
-from dolens.experiments.running.faults import machine_fault, reason_of
+from dolens.experiments.running.main import machine_fault, reason_of
 from dolens.experiments.running.run_files import flat
 from dolens.experiments.running.training import run
 from scripts.guarded_cases import guarded, place_of, unclear

@@ -18,7 +18,7 @@ from dolens.analysis.field_curves import DISTORTION_REFERENCES, field_curves, im
 from dolens.analysis.footprint import footprint
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
-from dolens.analysis.ray_fans import ray_fans
+from dolens.analysis.ray_intercepts import ray_fans
 from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.illumination import relative_illumination

@@ -19,7 +19,7 @@ from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
-from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
+from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality, WavefrontResiduals
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import (
     MOST_WEIGHT,
@@ -38,7 +38,6 @@ from dolens.optimize.ray_intercept_quality import (
 )
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
-from dolens.optimize.wavefront_residuals import WavefrontResiduals
 from dolens.typed_values import call_with_settings, check_types
 
 SAMPLINGS: dict[str, Callable[..., SpotRays]] = {

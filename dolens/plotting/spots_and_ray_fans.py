@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
-from dolens.analysis.ray_fans import RayFans
+from dolens.analysis.ray_intercepts import RayFans
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.errors import InputError
 from dolens.optics.fields import field_label

@@ -9,12 +9,11 @@ belongs to nobody else: pyplot does not know it.
 The numbers behind each figure come from the functions that the methods call.
 """
 
-from dolens.views.image_quality import ImagePointViews, OverFieldViews
+from dolens.views.image_quality import ImageQualityViews
 from dolens.views.overview import OverviewViews
-from dolens.views.wavefronts import WavefrontViews
 
 
-class LensViews(OverviewViews, ImagePointViews, OverFieldViews, WavefrontViews):
+class LensViews(OverviewViews, ImageQualityViews):
     """Methods of `Lens` that show it.
 
     Arguments that all of them share:

@@ -1,4 +1,6 @@
-"""Image quality of a lens: spots, fans, MTF and PSF at field points, and curves over the field."""
+"""Image quality of a lens: spots, fans, MTF, PSF and wavefronts at field points, and curves over
+the field.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import check_choice
 from dolens.views.overview import as_lens, looked_at, shown, title_of
 
 if TYPE_CHECKING:
@@ -19,15 +21,11 @@ if TYPE_CHECKING:
 KINDS = ("fourier", "huygens")
 
 
-def check_kind(kind: str) -> None:
-    """Raise `InputError` where a kind of diffraction calculation is none of `KINDS`."""
-    if kind not in KINDS:
-        raise InputError(f"kind must be one of {', '.join(KINDS)}, not '{kind}'")
-
-
-class ImagePointViews:
-    """Methods of `Lens` that show the image of some field points; see `LensViews` for their
+class ImageQualityViews:
+    """Methods of `Lens` that show its image and its wavefronts; see `LensViews` for their
     arguments."""
+
+    # ---------------------------------------------------------------- at field points
 
     def spots(
         self,
@@ -62,8 +60,8 @@ class ImagePointViews:
         object_distance: float | None = None,
         **aperture: float,
     ) -> Figure:
-        """Plot transverse ray aberrations; see `analysis.ray_fans.ray_fans`."""
-        from dolens.analysis.ray_fans import ray_fans
+        """Plot transverse ray aberrations; see `analysis.ray_intercepts.ray_fans`."""
+        from dolens.analysis.ray_intercepts import ray_fans
         from dolens.plotting.spots_and_ray_fans import ray_fans_figure
 
         lens, given = looked_at(self.ray_fans, fields, wavelengths, object_distance, aperture)
@@ -99,7 +97,7 @@ class ImagePointViews:
             kind: of the diffraction: `fourier`, or `huygens`, which takes far longer.
             aperture: see the class.
         """
-        check_kind(kind)
+        check_choice(kind, KINDS, "kind")
         from dolens.analysis.modulation_transfer import frequency_range, modulation
         from dolens.diffraction.huygens import huygens_modulation
         from dolens.diffraction.modulation_transfer import diffraction_modulation
@@ -170,7 +168,7 @@ class ImagePointViews:
                 steep for it; or `huygens`, the sum of wavelets, which takes far longer.
             aperture: see the class.
         """
-        check_kind(kind)
+        check_choice(kind, KINDS, "kind")
         from dolens.diffraction.huygens import huygens_point_spread
         from dolens.diffraction.point_spread import point_spread
         from dolens.plotting.point_spread import point_spread_figure
@@ -180,9 +178,62 @@ class ImagePointViews:
         found = by_waves(lens, given.fields, given.wavelengths, given.object_distance)
         return shown(point_spread_figure(found, title_of("Point spread functions", lens, given)))
 
+    def wavefront(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        **aperture: float,
+    ) -> Figure:
+        """Show the wavefront error of every field over the stop.
 
-class OverFieldViews:
-    """Methods of `Lens` that show curves over the field; see `LensViews` for their arguments."""
+        See `diffraction.wavefront_map.wavefront_maps`, also for its sign.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: None for the reference wavelength.
+            object_distance: see the class.
+            aperture: see the class.
+        """
+        from dolens.diffraction.wavefront_map import wavefront_maps
+        from dolens.plotting.wavefront_maps import wavefront_maps_figure
+
+        waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
+        lens, given = looked_at(self.wavefront, fields, waves, object_distance, aperture)
+        maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
+        return shown(wavefront_maps_figure(maps, title_of("Wavefront error", lens, given)))
+
+    def zernike(
+        self,
+        fields: FieldPoints | None = None,
+        wavelength: float | None = None,
+        object_distance: float | None = None,
+        order: str = "fringe",
+        terms: int = 16,
+        **aperture: float,
+    ) -> Figure:
+        """Plot Zernike coefficients of the wavefront error of every field.
+
+        See `diffraction.wavefront_map.WavefrontMaps.zernike` for the numbers.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelength: nm; None for the reference wavelength.
+            object_distance: see the class.
+            order: `fringe`, or `standard` (Noll's).
+            terms: how many to show.
+            aperture: see the class.
+        """
+        from dolens.diffraction.wavefront_map import wavefront_maps
+        from dolens.plotting.wavefront_maps import zernike_figure
+
+        wavelength = wavelength or as_lens(self).primary_wavelength
+        lens, given = looked_at(self.zernike, fields, wavelength, object_distance, aperture)
+        maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
+        title = title_of("Zernike coefficients", lens, given)
+        return shown(zernike_figure(maps, order, terms, title))
+
+    # ---------------------------------------------------------------- over the field
 
     def field_curves(
         self,
@@ -315,3 +366,33 @@ class OverFieldViews:
         ]
         title = title_of("Relative illumination", lens, given)
         return shown(illumination_figure(curves, title))
+
+    def strehl(
+        self,
+        edge: float | Sequence[float] | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        count: int = 7,
+        **aperture: float,
+    ) -> Figure:
+        """Plot Strehl ratios over the field; see `diffraction.point_spread.strehl_ratios`.
+
+        Args:
+            edge: of the field, as in `field_curves`.
+            wavelengths: None for the reference wavelength.
+            object_distance: see the class.
+            count: field points from the axis to the edge.
+            aperture: see the class.
+        """
+        from dolens.analysis.conditions import field_scans
+        from dolens.diffraction.point_spread import strehl_ratios
+        from dolens.plotting.wavefront_maps import strehl_figure
+
+        waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
+        lens, given = looked_at(self.strehl, 0.0, waves, object_distance, aperture)
+        distance = given.object_distance
+        scans = [
+            (scan, strehl_ratios(lens, scan, given.wavelengths, distance))
+            for scan in field_scans(lens, distance, edge, count)
+        ]
+        return shown(strehl_figure(scans, title_of("Strehl ratio", lens, given)))

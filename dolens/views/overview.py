@@ -1,4 +1,4 @@
-"""A lens shows its numbers and its section, at conditions that all views share."""
+"""A lens shows its numbers, its section and its footprints, at conditions that all views share."""
 
 from __future__ import annotations
 
@@ -74,6 +74,31 @@ class OverviewViews:
                 rays,
             )
         )
+
+    def footprint(
+        self,
+        fields: FieldPoints | None = None,
+        wavelength: float | None = None,
+        object_distance: float | None = None,
+        rays: int = 1000,
+        **aperture: float,
+    ) -> Figure:
+        """Draw where the rays of the fields meet every surface; see `analysis.footprint.footprint`.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelength: nm; None for the reference wavelength.
+            object_distance: see the class.
+            rays: of each field, a multiple of four.
+            aperture: see the class.
+        """
+        from dolens.analysis.footprint import footprint
+        from dolens.plotting.footprint import footprint_figure
+
+        wavelength = wavelength or as_lens(self).primary_wavelength
+        lens, given = looked_at(self.footprint, fields, wavelength, object_distance, aperture)
+        found = footprint(lens, given.fields, wavelength, rays, given.object_distance)
+        return shown(footprint_figure(found, title_of("Footprints", lens, given)))
 
 
 Wavelengths = float | Sequence[float] | Tensor | None

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.field_curves import field_curves
-from dolens.analysis.ray_fans import ray_fans
+from dolens.analysis.ray_intercepts import ray_fans
 from dolens.analysis.spot_diagram import working_f_numbers
 from dolens.experiments.design.merit_rays import (
     COMMON_CENTROID,

@@ -17,15 +17,15 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.running.catalogue import configuration_folders
 from dolens.experiments.running.command_line import explained
 from dolens.experiments.running.recorded_run import RecordedRun
-from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.target_keys import (
+from dolens.experiments.running.refused_settings import (
     refuse_missing,
     refuse_targets_in_lenses,
     refuse_unknown_keys,
+    refuse_unread,
     refuse_wrong_types,
 )
+from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
-from dolens.experiments.running.unread_settings import refuse_unread
 from dolens.experiments.settings import register_resolvers
 from dolens.files import packaged_configuration
 

@@ -26,9 +26,9 @@ from dolens.experiments.running.checkpoints import (
 )
 from dolens.experiments.running.configuration import with_overrides
 from dolens.experiments.running.recorded_run import RecordedRun, read_record
+from dolens.experiments.running.refused_settings import refuse_unknown_keys, refuse_wrong_types
 from dolens.experiments.running.run_files import RESOLVED
 from dolens.experiments.running.run_settings import RunSettings
-from dolens.experiments.running.target_keys import refuse_unknown_keys, refuse_wrong_types
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 from dolens.experiments.running.user_configuration import import_extensions
 from dolens.experiments.settings import register_resolvers

@@ -21,8 +21,11 @@ from dolens.experiments.callbacks.checkpoints import (
     ResumedEpochs,
     ResumedSchedules,
 )
-from dolens.experiments.callbacks.interruption import InterruptionNotice, LoggedObjectives
-from dolens.experiments.callbacks.starvation import StarvationWarning
+from dolens.experiments.callbacks.interruption import (
+    InterruptionNotice,
+    LoggedObjectives,
+    StarvationWarning,
+)
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, all_settings, choices_of, summarise
@@ -35,6 +38,7 @@ from dolens.experiments.running.checkpoints import (
 from dolens.experiments.running.command_line import command
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.process_settings import set_matmul_precision, set_threads
+from dolens.experiments.running.refused_settings import names_of_targets
 from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
 from dolens.experiments.running.run_folder import (
     describe_run,
@@ -42,7 +46,6 @@ from dolens.experiments.running.run_folder import (
     plain_metrics,
 )
 from dolens.experiments.running.run_settings import RunSettings, refuse_unknown, returned
-from dolens.experiments.running.target_keys import names_of_targets
 from dolens.experiments.running.trainer import all_processes, made_trainer
 from dolens.experiments.running.user_configuration import import_extensions
 from dolens.experiments.search.pruning import TrialPruned, trial_callbacks

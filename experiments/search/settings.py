@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.experiments.running.target_keys import refuse_unknown_keys
+from dolens.experiments.running.refused_settings import refuse_unknown_keys
 
 if TYPE_CHECKING:
     from optuna.pruners import BasePruner

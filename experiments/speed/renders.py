@@ -5,12 +5,17 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from dolens.errors import InputError, check_keys
+from dolens.experiments.settings import check_finite, check_sensor_distance, numbers_of
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_names import to_lens_units
+from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.field_grid import spread_pixels, survey
 from dolens.rendering.auto.probes import Reference, grey_levels, probe_image, reference
@@ -29,11 +34,13 @@ from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.pixels import Sensor
+from dolens.typed_values import call_with_settings, check_type
 
 # Renders by more rays than these are timed on a window, and that multiplied.
 _MANY, _WINDOW, _MARGIN = 128, 64, 48
 # Pixels along each side of functions, where no plan says how many are enough.
 _PSF_SIZE = 65
+_SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,42 @@ class Subject:
     scene: PlanarScene
     sensor: Sensor
     variables: tuple[str, ...]
+
+    @classmethod
+    def of(cls, name: str, settings: Mapping[str, Any]) -> Self:
+        """Return a lens and its scene as a configuration gives them.
+
+        Args:
+            name: of the scene.
+            settings: `lens` (a prescription), `values` (parameters to change), `depths` (mm),
+                `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken
+                of.
+
+        Raises:
+            InputError: an unknown key, or a bad value.
+        """
+        check_keys(settings, _SCENE_KEYS, f"scenes.{name}")
+        for key in _SCENE_KEYS:
+            if key != "values" and key not in settings:
+                raise InputError(f"scenes.{name}.{key}: is missing")
+        lens = lens_from_prescription(settings["lens"], torch.float32, where=f"scenes.{name}.lens")
+        check_sensor_distance(lens, f"scenes.{name}.lens")
+        with torch.no_grad():
+            for pattern, value in (settings.get("values") or {}).items():
+                check_finite(f"scenes.{name}.values.{pattern}", value)
+                for key, parameter in lens.variables([pattern]).items():
+                    parameter.fill_(to_lens_units(key, value))
+        numbers = {
+            k: numbers_of(f"scenes.{name}.{k}", settings[k]) for k in ("depths", "wavelengths")
+        }
+        scene = PlanarScene(**numbers)
+        sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
+        check_type(settings["variables"], Sequence[str], f"scenes.{name}.variables")
+        try:
+            names = tuple(lens.variables(list(settings["variables"])))
+        except InputError as error:
+            raise InputError(f"scenes.{name}.variables: {error}") from error
+        return cls(name, lens.requires_grad_(False), scene, sensor, names)
 
     def texture(self) -> Tensor:
         """Return a probe image that covers the sensor."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.tables import Row
+from dolens.optics.text_tables import text_table
 from dolens.plotting.style import plain_text
 from dolens.plotting.tolerances import (
     matrix_figure,
@@ -108,14 +109,7 @@ def offender_text(found: ToleranceAnalysis) -> str:
         )
         for row, _ in zip(offender_rows(found), range(_MOST), strict=False)
     ]
-    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
-    return "\n".join(_line(row, widths) for row in (heads, *rows))
-
-
-def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    cells = [row[0].ljust(widths[0])]
-    cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-    return "  ".join(cells).rstrip()
+    return text_table(heads, rows)
 
 
 _MOST_OFFENDERS = 20

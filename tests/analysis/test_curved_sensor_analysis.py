@@ -16,16 +16,16 @@ from dolens.alignment.pose import Pose
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.analysis.ray_fans import ray_fans
+from dolens.analysis.ray_intercepts import ray_fans
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.diffraction.entrance_beam import find_beam
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
 from dolens.diffraction.wavefront import pupil_wavefront
+from dolens.optimize.image_quality import WavefrontResiduals
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import LensProperties, operand
 from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
 from dolens.optimize.variables import DesignVariables
-from dolens.optimize.wavefront_residuals import WavefrontResiduals
 from dolens.plotting.section import sensor_curve
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.ray_renderer import RayRenderer

@@ -11,8 +11,7 @@ from scipy.special import j1
 from dolens import load_lens
 from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.analysis.ray_fans import ray_fans
-from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
+from dolens.analysis.ray_intercepts import ray_fans, trace_ray_intercepts, uniform_pupil_points
 from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength, spot_diagram
 from dolens.errors import InputError
 from dolens.optics.paraxial import chief_ray_magnification

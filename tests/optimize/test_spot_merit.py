@@ -14,11 +14,10 @@ from dolens.analysis.pupil_quadrature import (
 )
 from dolens.errors import InputError
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
-from dolens.optimize.image_quality import without_edges
+from dolens.optimize.image_quality import WavefrontResiduals, without_edges
 from dolens.optimize.linear_least_squares import damped_step
 from dolens.optimize.merit_settings import LOSSES
 from dolens.optimize.ray_intercept_quality import RayInterceptResiduals
-from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
 LINES = (656.2725, 587.5618, 486.1327)
 

@@ -9,7 +9,7 @@ import torch
 
 from dolens import load_lens
 from dolens.analysis.modulation_transfer import modulation
-from dolens.analysis.ray_fans import RayFans, ray_fans
+from dolens.analysis.ray_intercepts import RayFans, ray_fans
 from dolens.analysis.spot_diagram import (
     SpotDiagram,
     rms_against_field,

@@ -9,7 +9,7 @@ from torch.utils.data import DataLoader
 from dolens.errors import InputError
 from dolens.experiments.data.crop_loading import CropLoader, LostWorkerError, Waiting
 from dolens.experiments.data.image_folder import ImageFolderDataModule
-from dolens.experiments.running.faults import machine_fault
+from dolens.experiments.running.main import machine_fault
 
 
 @pytest.fixture(scope="module")

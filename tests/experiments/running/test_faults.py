@@ -20,7 +20,7 @@ from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.trackers import TensorBoard
 from dolens.experiments.running import checkpoints
 from dolens.experiments.running.checkpoints import WholeCheckpoints, read_checkpoint
-from dolens.experiments.running.faults import machine_fault, thread_faults_in_one_line
+from dolens.experiments.running.main import machine_fault, thread_faults_in_one_line
 from dolens.experiments.running.run_files import write_json
 from dolens.experiments.running.run_folder import LogFile
 

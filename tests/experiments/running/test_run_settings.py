@@ -12,8 +12,8 @@ from dolens.experiments.callbacks.interruption import LoggedObjectives
 from dolens.experiments.design.design import DesignModule
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.command_line import no_choice
+from dolens.experiments.running.refused_settings import names_of_targets
 from dolens.experiments.running.run_settings import RunSettings, is_among, refuse_unknown, returned
-from dolens.experiments.running.target_keys import names_of_targets
 from dolens.experiments.running.training import build_lens, build_module
 from tests.experiments.tiny_experiment import TRAINED
 

@@ -8,7 +8,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.running.unread_settings import References
+from dolens.experiments.running.refused_settings import References
 
 UNREAD = {
     "a group": (["experiment=asphere", "discriminator=double_scale"], "discriminator="),

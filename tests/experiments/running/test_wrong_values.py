@@ -20,7 +20,7 @@ from dolens.experiments.poses.accuracy_tasks import BasinSettings
 from dolens.experiments.poses.fit_plan import fit_plan, plain_imager
 from dolens.experiments.poses.triplet_alignment import Misalignments
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.running.faults import machine_fault, reason_of
+from dolens.experiments.running.main import machine_fault, reason_of
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
 from dolens.experiments.settings import total_steps
