@@ -43,7 +43,7 @@ ALONE = ("experiments", "report")
 # Pages take seconds: one is written, and of the others the arguments are tried.
 FIRST_PAGE = ("dolens", "show", "cooke_triplet", "--html", "triplet.html")
 # Of a page's Python: sizes of an hour's work, and processes, which
-# tests/experiments/workers/test_workers.py starts.
+# tests/experiments/test_workers.py starts.
 SIZES = {"draw(100_000,": "draw(1_000,", "workers_of(2)": "workers_of(0)"}
 OTHERS = (
     ".venv/bin/pip",

@@ -29,8 +29,7 @@ from dolens.experiments.lens_search.trained_camera import CameraTask, train_came
 from dolens.experiments.running.finished_run import load_run
 from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
-from dolens.experiments.workers import workers_of
-from dolens.experiments.workers.workers import OwnThreads
+from dolens.experiments.workers import OwnThreads, workers_of
 from dolens.lens_search.search import SearchPlan
 from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens

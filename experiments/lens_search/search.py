@@ -24,8 +24,7 @@ from dolens.experiments.lens_search.found_forms import (
 )
 from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
-from dolens.experiments.workers import workers_of
-from dolens.experiments.workers.workers import OwnThreads
+from dolens.experiments.workers import OwnThreads, workers_of
 from dolens.files import written_whole
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs, designed_lens

@@ -27,8 +27,8 @@ from dolens.experiments.callbacks.interruption import (
     StarvationWarning,
 )
 from dolens.experiments.experiment import Experiment, check_experiment
-from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, all_settings, choices_of, summarise
+from dolens.experiments.loggers.trackers import History
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
     WholeCheckpoints,

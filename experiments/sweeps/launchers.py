@@ -17,7 +17,7 @@ from hydra.core.utils import JobReturn
 from dolens.errors import InputError, check_choice, one_line
 from dolens.experiments.running.process_settings import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
-from dolens.experiments.workers.ray_cluster import joined_cluster, local_cluster
+from dolens.experiments.workers import joined_cluster, local_cluster
 from dolens.threads import allowed_processors
 
 logger = logging.getLogger(__name__)

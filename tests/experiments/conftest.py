@@ -21,10 +21,10 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
+from dolens.experiments import workers
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_module, run
-from dolens.experiments.workers import workers
 from dolens.tasks import in_turn
 from tests.experiments.runs import Finished
 from tests.experiments.tiny_experiment import CAMERA, TRAINED

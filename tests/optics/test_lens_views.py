@@ -146,7 +146,7 @@ def test_wrong_options_are_named(singlet):
         singlet.spots(f_numbre=4.0)
     with pytest.raises(InputError, match="object_distance"):
         singlet.draw(object_distance=-1.0)
-    with pytest.raises(InputError, match="kind: 'fft' .*fourier, huygens"):
+    with pytest.raises(InputError, match=r"kind: 'fft' .*fourier, huygens"):
         singlet.psf(kind="fft")
     with pytest.raises(InputError, match="fringe, standard, not 'noll'"):
         singlet.zernike(order="noll")

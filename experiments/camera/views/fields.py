@@ -10,15 +10,13 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.experiments.camera.views.base import Comparison, Imaging, Shot, Views, seed_of
-from dolens.experiments.camera.views.field_windows import (
-    FieldWindows,
-    field_functions,
-    field_imaging,
-)
 from dolens.experiments.camera.views.truth import (
     CENTROIDS,
     TRUTHS,
+    FieldWindows,
     check_truth,
+    field_functions,
+    field_imaging,
     nearest_texel,
     reference_centroid_map,
     reference_chief_ray_map,

@@ -9,8 +9,8 @@ from dolens.experiments.camera.as_built import AsBuilt, Manufacture
 from dolens.experiments.camera.evaluation import restored_by_rivals
 from dolens.experiments.camera.made_lenses import images_of_made_lenses
 from dolens.experiments.camera.views.base import Shot
-from dolens.experiments.camera.views.field_windows import field_functions
 from dolens.experiments.camera.views.fields import FieldViews
+from dolens.experiments.camera.views.truth import field_functions
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.pictures import write_picture

@@ -11,10 +11,9 @@ from hydra.utils import instantiate
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.photograph_results import ValidationPictures, side_by_side
-from dolens.experiments.loggers import history as history_file
-from dolens.experiments.loggers.history import History
+from dolens.experiments.loggers import trackers as history_file
 from dolens.experiments.loggers.protocol import RunSummary, TakesPictures, TakesSummary, summarise
-from dolens.experiments.loggers.trackers import TensorBoard
+from dolens.experiments.loggers.trackers import History, TensorBoard
 from tests.experiments.runs import rows_of
 from tests.experiments.tiny_experiment import CAMERA, UNTESTED
 

@@ -15,9 +15,8 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.experiments.callbacks import saved_figures
-from dolens.experiments.loggers import history as history_file
-from dolens.experiments.loggers.history import History
-from dolens.experiments.loggers.trackers import TensorBoard
+from dolens.experiments.loggers import trackers as history_file
+from dolens.experiments.loggers.trackers import History, TensorBoard
 from dolens.experiments.running import checkpoints
 from dolens.experiments.running.checkpoints import WholeCheckpoints, read_checkpoint
 from dolens.experiments.running.main import machine_fault, thread_faults_in_one_line

@@ -14,9 +14,7 @@ import torch
 from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.workers import workers_of
-from dolens.experiments.workers.ray_cluster import RayWorkers
-from dolens.experiments.workers.workers import OwnThreads
+from dolens.experiments.workers import OwnThreads, RayWorkers, workers_of
 from dolens.tasks import TaskError, listening
 from dolens.tolerancing import tolerances_from, trace_perturbed
 
