@@ -30,10 +30,10 @@ lens = dolens.load_lens("conf/lens/nikon.yaml")
 rays = dolens.Rays(torch.zeros(20, 3) - 1.0, torch.tensor([0.0, 0.0, 1.0]), 550.0)
 lens.trace(rays).position.sum().backward()
 lens.first_order(), lens.seidel(10.0)
-# A lens in the terminal needs no drawing, and aiming a ray no compiler of PyTorch's.
+# A lens in the terminal needs no drawing and no page, and aiming a ray no compiler of PyTorch's.
 from dolens.lens_page.overview import lens_overview, prepared_lens
 lens.chief_ray((0.0, 10.0))
-assert not loaded("sympy", "torch._dynamo", "matplotlib")
+assert not loaded("sympy", "torch._dynamo", "matplotlib", "jinja2")
 assert not loaded("dolens.prescriptions.zemax", "dolens.prescriptions.codev")
 # Nor do elements of glass.
 import dolens.manufacturing.glass_elements

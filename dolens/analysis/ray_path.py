@@ -1,6 +1,5 @@
 """One ray is followed from surface to surface, with the reason why it ends where it does."""
 
-import html
 import math
 from dataclasses import dataclass
 
@@ -85,8 +84,8 @@ class RayPath:
 
     def _repr_html_(self) -> str:
         """Return the table and the ending as HTML, all text escaped."""
-        table = html_table(HEADINGS, [row.cells() for row in self.crossings], self.heading)
-        return f"{table}<p>{html.escape(self.ending)}</p>"
+        rows = [crossing.cells() for crossing in self.crossings]
+        return html_table(HEADINGS, rows, self.heading, note=self.ending)
 
 
 @torch.no_grad()

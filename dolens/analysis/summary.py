@@ -1,6 +1,5 @@
 """A summary tells a lens's first-order data, Seidel sums and spot sizes at a glance."""
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -133,8 +132,10 @@ class LensSummary(FirstOrderNumbers):
     def _repr_html_(self) -> str:
         """Return the summary as HTML, all text escaped."""
         return (
-            html_table(("first order", "", ""), self.first_order_cells(), self.heading, {0, 2})
-            + (f"<p>{html.escape(self.note)}</p>" if self.note else "")
+            html_table(
+                *(("first order", "", ""), self.first_order_cells(), self.heading, {0, 2}),
+                self.note,
+            )
             + html_table(self.field_headings, self.field_cells())
             + html_table(self.seidel_headings, self.seidel_cells(), left={0, 1})
         )

@@ -9,26 +9,18 @@ from pathlib import Path
 import torch
 
 from dolens.errors import InputError
-from dolens.html import Child, Markup, joined
-from dolens.lens_page.markup import (
-    GENERATOR,
-    Block,
-    figure_html,
-    holds_pictures,
-    inline_svg,
-    note_html,
-    page_html,
-    problem_html,
-    rasterise,
-    table_html,
-)
+from dolens.files import installed_version
+from dolens.html import rendered
+from dolens.lens_page.markup import PAGE, Block, figure_html, rasterise
 from dolens.lens_page.overview import Overview, lens_overview, prepared_lens
-from dolens.lens_page.sections import Content, PageSections, Section
+from dolens.lens_page.sections import PageSections, Section
 from dolens.lens_page.tables import number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.export import laid_out, save_figures
 
+# Every page says by this what it is, so that only pages are overwritten unasked.
+GENERATOR = "dolens show"
 # Whose figures are drawn.
 _MOST_FIELDS = 9
 
@@ -92,12 +84,13 @@ def write_page(
     shown, about = _with_few_fields(lens, overview)
     listed = PageSections(shown, about, tolerances).sections()
     written = Written()
-    blocks = _overview_blocks(overview, written)
+    blocks = _overview_blocks(overview)
     said = progress or (lambda title, done, total: None)
     for at, section in enumerate(listed):
         said(section.title, at, len(listed))
         blocks.append(_block(section, path is not None, figures, written))
     said("done", len(listed), len(listed))
+    written.problems = [(block.title, text) for block in blocks for text in block.problems]
     # The section and the view in space come first, before the tables.
     first = 1 + next(n for n, section in enumerate(listed) if section.name == "space")
     tables, drawings = blocks[: len(overview.sections)], blocks[len(overview.sections) :]
@@ -107,7 +100,16 @@ def write_page(
         if about is not overview:
             labels = [field_label(p, about.conditions.field_unit) for p in about.conditions.fields]
             facts.append(("fields of the figures", f"{len(labels)} of them: {', '.join(labels)}"))
-        _write(Path(path), page_html(overview.name, facts, command, blocks))
+        page = rendered(
+            PAGE,
+            title=overview.name,
+            facts=facts,
+            command=command,
+            sections=blocks,
+            generator=GENERATOR,
+            version=installed_version("dolens") or "",
+        )
+        _write(Path(path), page)
     written.sections = len(blocks)
     return written
 
@@ -145,50 +147,42 @@ def is_page(path: str | Path) -> bool:
         return f'name="generator" content="{GENERATOR} '.encode() in file.read(600)
 
 
-def _overview_blocks(overview: Overview, written: Written) -> list[Block]:
-    blocks = []
-    for section in overview.sections:
-        body = joined(*map(problem_html, section.problems), *map(table_html, section.tables))
-        written.problems += [(section.title, problem) for problem in section.problems]
-        name = re.sub(r"[^a-z]+", "-", section.title.lower())
-        blocks.append(Block(name, section.title, body))
-    return blocks
+def _overview_blocks(overview: Overview) -> list[Block]:
+    return [
+        Block(
+            re.sub(r"[^a-z]+", "-", section.title.lower()),
+            section.title,
+            problems=section.problems,
+            tables=section.tables,
+        )
+        for section in overview.sections
+    ]
 
 
 def _block(section: Section, drawn: bool, folder: str | Path | None, written: Written) -> Block:
     """Compute a section; where that fails the section says why."""
+    figures = []
     try:
         content = section.make()
-        body = _body(section, content, drawn, folder, written)
+        for name, figure in content.figures.items():
+            written.figures += 1
+            with laid_out(figure):
+                if drawn:
+                    label = f"{section.title}: {name.replace('_', ' ')}"
+                    figures.append(figure_html(figure, re.sub(r"\W", "", name), label))
+                if folder is not None:
+                    rasterise(figure)
+                    save_figures(figure, Path(folder) / name, ("png", "svg"))
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
     except Exception as error:
         known = isinstance(error, InputError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
-        reason = " ".join(reason.split())
-        written.problems.append((section.title, reason))
-        body = problem_html(reason)
-    return Block(section.name, section.title, body)
-
-
-def _body(
-    section: Section, content: Content, drawn: bool, folder: str | Path | None, written: Written
-) -> Markup:
-    parts: list[Child] = [note_html(content.note), content.html]
-    for name, figure in content.figures.items():
-        written.figures += 1
-        with laid_out(figure):
-            if drawn:
-                label = f"{section.title}: {name.replace('_', ' ')}"
-                svg = inline_svg(figure, re.sub(r"\W", "", name), label)
-                parts.append(figure_html(svg, holds_pictures(figure)))
-            if folder is not None:
-                rasterise(figure)
-                save_figures(figure, Path(folder) / name, ("png", "svg"))
-    written.problems += [(section.title, problem) for problem in content.problems]
-    parts += [problem_html(problem) for problem in content.problems]
-    parts += [table_html(table) for table in content.tables]
-    return joined(*parts)
+        return Block(section.name, section.title, problems=[" ".join(reason.split())])
+    return Block(
+        *(section.name, section.title, content.note, content.space),
+        *(figures, content.problems, content.tables),
+    )
 
 
 def _facts(lens: Lens, overview: Overview) -> list[tuple[str, str]]:

@@ -36,8 +36,7 @@ from dolens.diffraction.wavefront_map import (
     wavefront_maps,
 )
 from dolens.errors import InputError
-from dolens.html import Markup
-from dolens.lens_page.markup import viewer_html
+from dolens.lens_page.markup import View, view
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
@@ -66,14 +65,14 @@ class Content:
         figures: file name without suffix → figure.
         tables: below the figures.
         note: a sentence above them.
-        html: elements above them.
+        space: the lens in space, above them.
         problems: what could not be computed, and why, a sentence each.
     """
 
     figures: dict[str, Figure] = field(default_factory=dict)
     tables: list[Table] = field(default_factory=list)
     note: str = ""
-    html: Markup | None = None
+    space: View | None = None
     problems: list[str] = field(default_factory=list)
 
 
@@ -176,7 +175,7 @@ class PageSections:
         lit = None if spots is None else spots.rms.isfinite().any(1).tolist()
         found = solid(self.lens, self.where, lit)
         return Content(
-            html=viewer_html(found, self.where),
+            space=view(found, self.where),
             note="Drag to turn, pinch or scroll (after a click) to zoom, shift and drag to move. "
             f"Rays at {self.where.reference_wavelength:g} nm.",
         )

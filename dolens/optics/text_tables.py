@@ -1,8 +1,7 @@
 """Tables of text cells, printed for a terminal or written as HTML for a notebook."""
 
 from collections.abc import Collection, Sequence
-
-from dolens.html import Markup, element
+from pathlib import Path
 
 Cells = Sequence[Sequence[str]]
 
@@ -28,7 +27,11 @@ def text_table(headings: Sequence[str], rows: Cells, left: Collection[int] = (0,
 
 
 def html_table(
-    headings: Sequence[str], rows: Cells, caption: str = "", left: Collection[int] = (0,)
+    headings: Sequence[str],
+    rows: Cells,
+    caption: str = "",
+    left: Collection[int] = (0,),
+    note: str = "",
 ) -> str:
     """Return a table as HTML; all text is escaped.
 
@@ -37,18 +40,17 @@ def html_table(
         rows: as many cells each.
         caption: above the table.
         left: numbers of the columns that are flush left; the others are flush right.
+        note: a sentence below the table.
     """
-    sides = [f"text-align:{'left' if n in left else 'right'}" for n in range(len(headings))]
+    from dolens.html import rendered  # loads jinja2, which only notebooks need
 
-    def line(tag: str, cells: Sequence[str]) -> Markup:
-        pairs = zip(cells, sides, strict=True)
-        return element("tr", *(element(tag, printable(cell), style=side) for cell, side in pairs))
-
-    return element(
-        "table",
-        element("caption", printable(caption)) if caption else None,
-        element("thead", line("th", headings)),
-        element("tbody", *(line("td", [minus(cell) for cell in row]) for row in rows)),
+    return rendered(
+        Path(__file__).with_name("table.html"),
+        headings=list(map(printable, headings)),
+        rows=[[printable(minus(cell)) for cell in row] for row in rows],
+        caption=printable(caption),
+        sides=["left" if n in left else "right" for n in range(len(headings))],
+        note=note,
     )
 
 

@@ -7,18 +7,16 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
-import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from PIL import Image
 
 from dolens.experiments.report.checks import SOURCES, Check, Material, Outcome, State
 from dolens.experiments.report.plan import Item, Row
 from dolens.experiments.report.runs import Result, shown_command, telling_overrides
-from dolens.html import prose, shown
+from dolens.html import rendered, shown
 from dolens.plotting.style import with_minus
 from dolens.sensor.image_files import opened_image
 
-_FOLDER = Path(__file__).parent
 _TITLE = "dolens: the dO supplement, run again"
 # As the page has them, with words for one check and for more.
 _STATES = (
@@ -32,30 +30,24 @@ _KINDS = {"printed": "printed", "exact": "exact", "measured": "measured", "state
 
 def page(material: Material) -> str:
     """Return the page as one HTML file without references to other files."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_FOLDER),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=lambda value: shown(value) if type(value) is str else value,
-    )
-    environment.filters |= {
-        "anchor": anchor,
-        "embedded": embedded,
-        "expected_text": expected_text,
-        "found_text": found_text,
-        "gain_sentence": gain_sentence,
-        "prose": lambda text: Markup(prose(text)),
-        "size_of": size_of,
-        "style": _style,
-    }
     results = material.results
 
     def cost(name: str, otherwise: str) -> str:
         return cost_text(results[name]) if name in results else otherwise
 
-    return environment.get_template("page.html").render(
+    return rendered(
+        Path(__file__).with_name("page.html"),
+        filters={
+            "anchor": anchor,
+            "embedded": embedded,
+            "expected_text": expected_text,
+            "found_text": found_text,
+            "gain_sentence": gain_sentence,
+            "prose": prose,
+            "size_of": size_of,
+            "style": _style,
+        },
         title=_TITLE,
-        rules=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         material=material,
         plan=material.plan,
         states=_STATES,
@@ -74,6 +66,13 @@ def page(material: Material) -> str:
         ours=lambda row: ours_text(material, row),
         version=lambda name: _version(material, name),
     )
+
+
+def prose(text: str) -> Markup:
+    """Return text in which what stands between backticks is code."""
+    parts = escape(shown(text)).split("`")
+    code = Markup("<code>{}</code>")
+    return Markup().join(code.format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
 def anchor(item: str) -> str:
