@@ -73,24 +73,26 @@ def of_page(lens):
 
 
 def of_point_spread(lens):
-    found = point_spread(lens, *own(lens), cells=32, half_width_um=30.0)
+    found = point_spread(lens, conditions(lens, *own(lens)), cells=32, half_width_um=30.0)
     return numbers(found.irradiance, found.strehl_ratio, found.centre, found.airy_radius_um)
 
 
 def of_huygens(lens):
     # Slow beams need few wavelets.
     slow = with_aperture(lens, f_number=25.0)
-    found = huygens_point_spread(slow, FIELDS[:1], lens.wavelengths, cells=4, half_width_um=6.0)
+    found = huygens_point_spread(
+        slow, conditions(slow, FIELDS[:1], lens.wavelengths), cells=4, half_width_um=6.0
+    )
     return numbers(found.irradiance, found.centre, found.airy_radius_um)
 
 
 def of_transfer(lens):
-    found = diffraction_modulation(lens, *own(lens), FREQUENCIES)
+    found = diffraction_modulation(lens, conditions(lens, *own(lens)), FREQUENCIES)
     return numbers(found.tangential, found.sagittal, found.tangential_limit)
 
 
 def of_rays_transfer(lens):
-    found = modulation(lens, *own(lens), FREQUENCIES, 2000)
+    found = modulation(lens, conditions(lens, *own(lens)), FREQUENCIES, 2000)
     return numbers(found.tangential, found.sagittal, found.diffraction_limit)
 
 
@@ -157,19 +159,23 @@ POLYCHROMATIC = {
     "summary": of_summary,
     "page": of_page,
     "spots": lambda lens: numbers(
-        *(lambda s: (s.polychromatic_centroid, s.polychromatic_rms))(spot_diagram(lens, *own(lens)))
+        *(lambda s: (s.polychromatic_centroid, s.polychromatic_rms))(
+            spot_diagram(lens, conditions(lens, *own(lens)))
+        )
     ),
-    "rms curve": lambda lens: rms_against_field(lens, lens.wavelengths, count=3).polychromatic,
-    "encircled energy of rays": lambda lens: encircled_energy(lens, *own(lens), RADII).energy,
-    "encircled energy": lambda lens: diffraction_encircled_energy(lens, *own(lens), RADII).energy,
+    "rms curve": lambda lens: rms_against_field(lens, conditions(lens), count=3).polychromatic,
+    "encircled energy of rays": lambda lens: (
+        encircled_energy(lens, conditions(lens, *own(lens)), RADII).energy
+    ),
+    "encircled energy": lambda lens: (
+        diffraction_encircled_energy(lens, conditions(lens, *own(lens)), RADII).energy
+    ),
     "point spread": of_point_spread,
     "Huygens": of_huygens,
-    "window of Huygens": lambda lens: numbers(
-        huygens_window(lens, torch.tensor(FIELDS[1]).double(), lens.wavelengths)
-    ),
+    "window of Huygens": lambda lens: numbers(huygens_window(lens, conditions(lens, FIELDS[1:2]))),
     "MTF": of_transfer,
     "MTF of rays": of_rays_transfer,
-    "frequencies": lambda lens: frequency_range(lens, *own(lens)),
+    "frequencies": lambda lens: frequency_range(lens, conditions(lens, *own(lens))),
     "worst offenders": of_offenders,
     "sensitivity": of_sensitivity,
     "design": of_design_figures,
@@ -198,7 +204,7 @@ def test_weights_are_shares_of_the_light(triplet, name):
 
 
 def test_a_polychromatic_radius_is_a_weighted_mean_of_squares(triplet):
-    spots = spot_diagram(triplet, FIELDS, WAVES, wavelength_weights=(1, 2, 5))
+    spots = spot_diagram(triplet, conditions(triplet, FIELDS, WAVES, wavelength_weights=(1, 2, 5)))
     w = torch.tensor([1.0, 2.0, 5.0]).double()[:, None] / 8.0
     mean = (w * spots.centroid).sum(1)
     away = (spots.centroid - mean[:, None]).square().sum(-1)
@@ -210,7 +216,10 @@ def test_other_wavelengths_than_the_lens_s_count_alike(triplet):
     lens = weighted(triplet, WAVES, (0, 1, 0))
     plain = weighted(triplet, WAVES)
     for waves in ((WAVES[0], 550.0, WAVES[2]), WAVES[:2]):
-        found, wanted = (spot_diagram(of, FIELDS, waves).polychromatic_rms for of in (lens, plain))
+        found, wanted = (
+            spot_diagram(of, conditions(of, FIELDS, waves)).polychromatic_rms
+            for of in (lens, plain)
+        )
         assert torch.equal(found, wanted)
     # Its own keep their weights in any order, on the command line too.
     turned = prepared_lens(weighted(triplet, WAVES, (1, 2, 4)), wavelengths=WAVES[::-1])

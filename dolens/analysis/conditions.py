@@ -17,13 +17,19 @@ sensor and no aperture limits the field below 60°, it is 20°.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
-from dolens.analysis.ray_intercepts import field_unit, uniform_pupil_points
+from dolens.analysis.fields_and_wavelengths import (
+    FieldPoints,
+    as_wavelengths,
+    field_points,
+    field_unit,
+    spectral_shares,
+)
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.errors import InputError
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import require_from_the_front
@@ -36,8 +42,6 @@ VISIBLE = (486.1327, 656.2725)
 # Beyond the visible a lens of one wavelength is looked at over so large a part of it.
 _SPREAD = 0.05
 
-FieldPoints = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
-
 
 @dataclass(frozen=True)
 class Conditions:
@@ -45,7 +49,6 @@ class Conditions:
 
     Attributes:
         fields: (F, 2), degrees for an object at infinity, else mm on the object; float64.
-        field_unit: `°` or `mm`.
         wavelengths: (W,), nm, float64.
         weights: (W,), shares of the wavelengths in polychromatic values; they sum to one.
         field_weights: (F,), shares of the fields in means over them; they sum to one.  The lens's
@@ -55,12 +58,45 @@ class Conditions:
     """
 
     fields: Tensor
-    field_unit: str
     wavelengths: Tensor
     weights: Tensor
     field_weights: Tensor
     reference_wavelength: float
     object_distance: float | None
+
+    @property
+    def field_unit(self) -> str:
+        """Return `°` or `mm`."""
+        return field_unit(self.object_distance)
+
+    def that_count(self) -> "Conditions":
+        """Return these conditions without the wavelengths whose weight is zero."""
+        counts = self.weights > 0.0
+        return replace(self, wavelengths=self.wavelengths[counts], weights=self.weights[counts])
+
+    def at(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: float | Sequence[float] | Tensor | None = None,
+    ) -> "Conditions":
+        """Return these conditions at other fields or wavelengths, which count alike.
+
+        Raises:
+            InputError: as `conditions` does.
+        """
+        found = self
+        if fields is not None:
+            points = field_points(fields)
+            found = replace(found, fields=points, field_weights=_alike(points))
+        if wavelengths is not None:
+            waves = as_wavelengths(wavelengths)
+            found = replace(found, wavelengths=waves, weights=_alike(waves))
+        return found
+
+
+def _alike(values: Tensor) -> Tensor:
+    """Return equal shares, one for each value."""
+    return torch.full((len(values),), 1.0 / len(values), dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -71,13 +107,18 @@ class FieldScan:
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         coordinate: (F,), along the line, degrees or mm; zero on the axis.
         direction: (2,), unit vector of the line.
-        field_unit: `°` or `mm`.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
     """
 
     fields: Tensor
     coordinate: Tensor
     direction: Tensor
-    field_unit: str
+    object_distance: float | None
+
+    @property
+    def field_unit(self) -> str:
+        """Return `°` or `mm`."""
+        return field_unit(self.object_distance)
 
     @property
     def axis(self) -> str:
@@ -91,7 +132,7 @@ def conditions(
     fields: FieldPoints | None = None,
     wavelengths: float | Sequence[float] | Tensor | None = None,
     object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | Tensor | None = None,
 ) -> Conditions:
     """Return the conditions of an analysis; the lens and the module's defaults fill in.
 
@@ -115,7 +156,6 @@ def conditions(
         waves = as_wavelengths(wavelengths)
     return Conditions(
         points,
-        field_unit(distance),
         waves,
         spectral_shares(lens, waves, wavelength_weights),
         field_shares(lens, None if fields is None else points),
@@ -132,27 +172,6 @@ def own_distance(lens: Lens, object_distance: float | None = None) -> float | No
     """
     distance = lens.object_distance if object_distance is None else object_distance
     return None if distance is None or vergence(distance) == 0.0 else float(distance)
-
-
-def field_points(fields: FieldPoints) -> Tensor:
-    """Return field points (F, 2), float64, of points, of numbers along y, or of one number.
-
-    Raises:
-        InputError: another shape, none at all, or numbers that are not finite.
-    """
-    message = f"fields must be numbers along y or pairs (x, y), at least one, not {fields}"
-    try:
-        points = torch.as_tensor(fields, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError):
-        raise InputError(message) from None
-    if points.ndim < 2:
-        points = points.reshape(-1)
-        points = torch.stack((torch.zeros_like(points), points), -1)
-    if points.ndim != 2 or points.shape[-1] != 2 or not len(points):
-        raise InputError(message)
-    if not bool(torch.isfinite(points).all()):
-        raise InputError(message)
-    return points
 
 
 def own_fields(lens: Lens, object_distance: float | None) -> Tensor:
@@ -262,13 +281,14 @@ def field_scans(
     reach = float(farthest.norm())
     if not reach > 0.0:
         raise InputError(f"lens '{lens.name}': no field but the axis; give the edge of the field")
-    unit = field_unit(object_distance)
     if lens.system().rotationally_symmetric:
         share = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
-        return [FieldScan(share[:, None] * farthest, share * reach, farthest / reach, unit)]
+        return [
+            FieldScan(share[:, None] * farthest, share * reach, farthest / reach, object_distance)
+        ]
     coordinate = torch.linspace(-reach, reach, 2 * count - 1, dtype=torch.float64)
     directions = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64)
-    return [FieldScan(coordinate[:, None] * d, coordinate, d, unit) for d in directions]
+    return [FieldScan(coordinate[:, None] * d, coordinate, d, object_distance) for d in directions]
 
 
 _WIDEST, _UNLIMITED = 60.0, 20.0

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import that_count
-from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
+from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, moments, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.field_and_aperture import in_double_precision
@@ -58,38 +59,32 @@ class EncircledEnergy:
 @torch.no_grad()
 def encircled_energy(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
+    where: Conditions,
     radii_um: Sequence[float] | Tensor | None = None,
     rays: int = 4000,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
 ) -> EncircledEnergy:
     """Compute the geometric encircled energy from rays spread uniformly over the stop.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm; all of a field make one spot.
+        where: fields, wavelengths with their weights, all of which make one spot of a field, and
+            object distance.
         radii_um: (Q,), µm, ascending; None for 101 from zero to the largest spot's.
         rays: of each field and wavelength, a multiple of four, before apertures clip any.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, radii that do not ascend from
-            zero or more, or a wrong number of rays.
+        InputError: radii that do not ascend from zero or more, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = uniform_pupil_points(rays)
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    waves, spectrum = that_count(lens, wavelengths, wavelength_weights)
-    intercepts = trace_ray_intercepts(lens, fields, waves, pupil, object_distance)
-    light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
+    where = where.that_count()
+    intercepts = trace_ray_intercepts(lens, where, pupil)
+    light = (weight * intercepts.valid * where.weights[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     centroid, _ = moments(points, light)
     distance = 1e3 * (points - centroid[:, None]).norm(dim=-1)
-    airy = 1e3 * AIRY * 1e-6 * (waves * working_f_numbers(lens, waves, object_distance))
+    airy = 1e3 * AIRY * 1e-6 * (where.wavelengths * working_f_numbers(lens, where))
     if radii_um is None:
         reach = float(distance.nan_to_num(0.0).amax()) or float(airy.amax())
         radii_um = torch.linspace(0.0, 1.02 * reach, 101, dtype=torch.float64)
@@ -105,12 +100,12 @@ def encircled_energy(
         within = torch.cat([share.new_zeros(1), share[lit][order].cumsum(0)])
         curves.append(within[inside] / within[-1])
     return EncircledEnergy(
-        intercepts.fields,
-        intercepts.field_unit,
-        waves,
+        where.fields,
+        where.field_unit,
+        where.wavelengths,
         radii,
         torch.stack(curves),
-        float(spectrum @ airy),
+        float(where.weights @ airy),
         (False,) * len(curves),
     )
 

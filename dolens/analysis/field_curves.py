@@ -8,7 +8,7 @@ Aberrations of Optical Systems, section 9.2); these derivatives take any surface
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -49,26 +49,22 @@ class ParabasalRays:
 
 
 def parabasal_rays(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
+    lens: Lens, scan: FieldScan, wavelengths: Sequence[float] | Tensor
 ) -> ParabasalRays:
-    """Trace the chief rays of fields, and the rays infinitely close to them.
+    """Trace the chief rays of a scan's fields, and the rays infinitely close to them.
 
     Apertures clip nothing here: a chief ray counts wherever it reaches the sensor.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        scan: F fields and the object distance.
         wavelengths: (W,), nm; each has its own chief ray.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
     """
     lens = in_double_precision(lens)
     options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
-    field = torch.as_tensor(fields, **options).reshape(-1, 2)
+    field = scan.fields.to(**options)
     waves = torch.as_tensor(wavelengths, **options).reshape(-1)
-    near = vergence(object_distance)
+    near = vergence(scan.object_distance)
     if near == 0.0:
         require_from_the_front(field, "a map of chief rays against the tangent of the field")
     with torch.enable_grad():
@@ -76,14 +72,14 @@ def parabasal_rays(
         linear = torch.deg2rad(field).tan() if near == 0.0 else field
         linear = linear[:, None].expand(-1, len(waves), 2).clone().requires_grad_()
         given = torch.rad2deg(linear.atan()) if near == 0.0 else linear
-        aimed = lens.aim(given, (0.0, 0.0), waves, object_distance)
+        aimed = lens.aim(given, (0.0, 0.0), waves, scan.object_distance)
         chief = lens.trace(aimed)
         reached = aimed.converged & arrives(chief.status)
         image_rate = _rates(chief.position[..., :2], linear)
 
         q = aimed.crossing.clone().requires_grad_()
         angles = torch.deg2rad(field) if near == 0.0 else field
-        line, _ = field_line(angles, object_distance)
+        line, _ = field_line(angles, scan.object_distance)
         ray = launch(line[:, None], near, q)
         hit = lens.trace(Rays.from_components(ray, waves))
         reached = reached & arrives(hit.status)
@@ -148,8 +144,7 @@ class FieldCurves:
 def field_curves(
     lens: Lens,
     scan: FieldScan,
-    wavelengths: list[float] | Tensor,
-    object_distance: float | None = None,
+    wavelengths: Sequence[float] | Tensor,
     distortion_reference: str = "f_tan_theta",
 ) -> FieldCurves:
     """Compute field curvature and distortion from rays infinitely close to the chief rays.
@@ -164,19 +159,16 @@ def field_curves(
         lens: the lens; apertures clip no chief ray.
         scan: fields on a line through the axis (see `field_scans`).
         wavelengths: (W,), nm, of the field curvature.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
         distortion_reference: `f_tan_theta`, or `f_theta` for an object at infinity.
 
     Raises:
         InputError: another reference, or `f_theta` of a near object.
     """
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).reshape(-1)
-    pencils = parabasal_rays(lens, scan.fields, waves, object_distance)
+    pencils = parabasal_rays(lens, scan, waves)
     along = scan.direction
     across = torch.stack((along[1], -along[0]))
-    chief = image_displacement(
-        lens, scan, [lens.primary_wavelength], object_distance, distortion_reference
-    )
+    chief = image_displacement(lens, scan, [lens.primary_wavelength], distortion_reference)
     return FieldCurves(
         scan,
         waves,
@@ -221,8 +213,7 @@ class ImageDisplacement:
 def image_displacement(
     lens: Lens,
     scan: FieldScan,
-    wavelengths: list[float] | Tensor,
-    object_distance: float | None = None,
+    wavelengths: Sequence[float] | Tensor,
     reference: str = "f_tan_theta",
 ) -> ImageDisplacement:
     """Compare chief rays with the image of an ideal lens; arguments are those of `field_curves`.
@@ -238,14 +229,15 @@ def image_displacement(
     if reference not in DISTORTION_REFERENCES:
         known = ", ".join(DISTORTION_REFERENCES)
         raise InputError(f"a distortion's reference is one of {known}, not '{reference}'")
-    infinite = vergence(object_distance) == 0.0
+    infinite = vergence(scan.object_distance) == 0.0
     if reference == "f_theta" and not infinite:
         raise InputError(
             "distortion from f·θ is that of an object at infinity; a near object has heights"
         )
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).reshape(-1)
-    axis = parabasal_rays(lens, [(0.0, 0.0)], [lens.primary_wavelength], object_distance)
-    chief = parabasal_rays(lens, scan.fields, waves, object_distance).position
+    on_axis = replace(scan, fields=torch.zeros(1, 2), coordinate=torch.zeros(1))
+    axis = parabasal_rays(lens, on_axis, [lens.primary_wavelength])
+    chief = parabasal_rays(lens, scan, waves).position
     image = axis.image_rate[0, 0] @ scan.direction
     rate = image.norm()
     outward = ((chief - axis.position[0]) * (image / rate)).sum(-1)

@@ -13,22 +13,35 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
+from dolens.optics.paraxial import vergence
+
+FieldPoints = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 
-def as_fields_and_wavelengths(
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    device: torch.device | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return fields (F, 2), degrees or mm, and wavelengths (W,), nm, in double precision.
+def field_points(fields: FieldPoints) -> Tensor:
+    """Return field points (F, 2), float64, of points, of numbers along y, or of one number.
 
     Raises:
-        InputError: fields that are not pairs, or none of either.
+        InputError: another shape, none at all, or numbers that are not finite.
     """
-    field = torch.as_tensor(fields, dtype=torch.float64, device=device)
-    if field.ndim != 2 or field.shape[-1] != 2 or len(field) == 0:
-        raise InputError(f"fields must be pairs (x, y), at least one, not {fields}")
-    return field, as_wavelengths(wavelengths).to(field.device)
+    message = f"fields must be numbers along y or pairs (x, y), at least one, not {fields}"
+    try:
+        points = torch.as_tensor(fields, dtype=torch.float64).detach().cpu()
+    except (TypeError, ValueError):
+        raise InputError(message) from None
+    if points.ndim < 2:
+        points = points.reshape(-1)
+        points = torch.stack((torch.zeros_like(points), points), -1)
+    if points.ndim != 2 or points.shape[-1] != 2 or not len(points):
+        raise InputError(message)
+    if not bool(torch.isfinite(points).all()):
+        raise InputError(message)
+    return points
+
+
+def field_unit(object_distance: float | None) -> str:
+    """Return the unit of field coordinates: `°` for an object at infinity, else `mm`."""
+    return "°" if vergence(object_distance) == 0.0 else "mm"
 
 
 def as_wavelengths(wavelengths: float | Sequence[float] | Tensor) -> Tensor:

@@ -1,12 +1,13 @@
 """Footprints show where the beams of the fields meet every surface, within its clear aperture."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import field_unit, launch_through_stop, uniform_pupil_points
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
+from dolens.analysis.ray_intercepts import launch_through_stop
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
@@ -50,28 +51,25 @@ class Footprint:
 @torch.no_grad()
 def footprint(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
+    where: Conditions,
     wavelength: float | None = None,
     rays: int = 1000,
-    object_distance: float | None = None,
 ) -> Footprint:
     """Trace rays spread uniformly over the stop, and tell where they meet each surface.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        where: fields and object distance.
         wavelength: nm; None for the reference wavelength.
         rays: of each field, a multiple of four, before apertures clip any.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Raises:
-        InputError: no fields, or a wrong number of rays.
+        InputError: a wrong number of rays.
     """
     lens = in_double_precision(lens)
-    wavelength = float(wavelength or lens.primary_wavelength)
+    wavelength = float(wavelength or where.reference_wavelength)
     pupil, weight = uniform_pupil_points(rays)
-    field = torch.as_tensor(fields, dtype=torch.float64)
-    launched = launch_through_stop(lens, field, [wavelength], pupil, object_distance)
+    launched = launch_through_stop(lens, where.at(wavelengths=wavelength), pupil)
     system = lens.system()
     hit = trace_rays(system, launched.rays, 1.0, True)
     started = launched.started[:, 0]
@@ -92,8 +90,8 @@ def footprint(
     passes = (hit.valid[:, 0] & started).cpu()
     away = stacked.norm(dim=-1).where(passes, -torch.inf).amax(-1)
     return Footprint(
-        launched.fields.cpu(),
-        field_unit(object_distance),
+        where.fields,
+        where.field_unit,
         wavelength,
         numbers,
         tuple(lens.surfaces[str(number)].aperture for number in numbers),

@@ -36,10 +36,7 @@ class LateralColour:
 
 
 def lateral_colour(
-    lens: Lens,
-    scan: FieldScan,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
+    lens: Lens, scan: FieldScan, wavelengths: Sequence[float] | Tensor
 ) -> LateralColour:
     """Compute lateral colour from real chief rays, each through the stop's centre at its own
     wavelength.
@@ -48,14 +45,13 @@ def lateral_colour(
         lens: the lens; apertures clip no chief ray.
         scan: fields on a line through the axis (see `field_scans`).
         wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
     """
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).reshape(-1)
     reference = lens.primary_wavelength
     every = torch.cat([waves, waves.new_tensor([reference])])
-    outward = image_displacement(lens, scan, every, object_distance).outward
+    outward = image_displacement(lens, scan, every).outward
     with torch.no_grad():
-        optics = first_order(lens.system().double(), reference, object_distance)
+        optics = first_order(lens.system().double(), reference, scan.object_distance)
     airy = 1e-3 * AIRY * reference * abs(float(optics.working_f_number))
     shift = 1e3 * (outward[:, :-1] - outward[:, -1:])
     return LateralColour(scan, waves, reference, shift, airy)

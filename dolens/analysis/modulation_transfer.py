@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import that_count
-from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
+from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.aiming import field_line
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import vergence
 
 DIRECTIONS = {"sagittal": (1.0, 0.0), "tangential": (0.0, 1.0)}
 # Keeps the modulus's slope finite where the transfer function is zero, and changes nothing else.
@@ -114,13 +114,7 @@ def diffraction_limited_transfer(
 
 @torch.no_grad()
 def modulation(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    frequencies: Sequence[float] | Tensor,
-    rays: int = 6000,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    lens: Lens, where: Conditions, frequencies: Sequence[float] | Tensor, rays: int = 6000
 ) -> Modulation:
     """Compute the polychromatic geometric MTF of a lens from rays spread uniformly over the stop.
 
@@ -128,28 +122,24 @@ def modulation(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths with their weights, and object distance.
         frequencies: (Q,), cycles/mm.
         rays: of each field and wavelength, a multiple of four, before apertures clip any.  What is
             left of contrast far beyond the first zero is noise of 1/√rays or less.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
+        InputError: a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = uniform_pupil_points(rays)
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    waves, spectrum = that_count(lens, wavelengths, wavelength_weights)
-    intercepts = trace_ray_intercepts(lens, fields, waves, pupil, object_distance)
-    field = intercepts.fields
-    light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
+    where = where.that_count()
+    intercepts = trace_ray_intercepts(lens, where, pupil)
+    light = (weight * intercepts.valid * where.weights[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
-    along = field_directions(field, object_distance)
+    along = field_directions(where)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
     curves = []
     for spot, share, tangential, sagittal in zip(points, light, along, across, strict=True):
@@ -161,28 +151,21 @@ def modulation(
             else frequency.new_full((2, len(frequency)), math.nan)
         )
     tangential, sagittal = torch.stack(curves, 1)
-    numbers = working_f_numbers(lens, waves, object_distance)
+    waves, numbers = where.wavelengths, working_f_numbers(lens, where)
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(
-        field,
-        intercepts.field_unit,
+        where.fields,
+        where.field_unit,
         waves,
         frequency,
         tangential,
         sagittal,
-        spectrum @ limits,
+        where.weights @ limits,
     )
 
 
 @torch.no_grad()
-def frequency_range(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    count: int = 61,
-    wavelength_weights: Sequence[float] | None = None,
-) -> Tensor:
+def frequency_range(lens: Lens, where: Conditions, count: int = 61) -> Tensor:
     """Return frequencies (count,), cycles/mm, from zero to where the sharpest field leaves little.
 
     A spot of Gaussian profile with the RMS radius r leaves a hundredth of the contrast at 0.68/r;
@@ -190,8 +173,7 @@ def frequency_range(
     or 5 times a power of ten.
     """
     lens = in_double_precision(lens)
-    waves, shares = that_count(lens, wavelengths, wavelength_weights)
-    spots = spot_diagram(lens, fields, waves, 400, object_distance, shares)
+    spots = spot_diagram(lens, where.that_count(), 400)
     cutoff = float((AIRY / spots.airy_radius).min())
     radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
     end = min(cutoff, 0.68 / max(radius, 1e-9))
@@ -200,15 +182,14 @@ def frequency_range(
     return torch.linspace(0.0, end, count, dtype=torch.float64)
 
 
-def field_directions(field: Tensor, object_distance: float | None) -> Tensor:
-    """Return unit vectors along the fields (F, 2) on the sensor, (F, 2); +y on the axis.
+def field_directions(where: Conditions) -> Tensor:
+    """Return unit vectors along the fields on the sensor, (F, 2); +y on the axis.
 
     Args:
-        field: (F, 2), degrees or mm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: fields and object distance.
     """
-    angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
-    line, _ = field_line(angles, object_distance)
+    field, distance = where.fields, where.object_distance
+    line, _ = field_line(torch.deg2rad(field) if where.field_unit == "°" else field, distance)
     across = line[..., :2]
     length = across.norm(dim=-1, keepdim=True)
     return torch.where(length > 0.0, across / length, across.new_tensor([0.0, 1.0]))

@@ -155,16 +155,14 @@ class FirstOrderNumbers:
 
 
 @torch.no_grad()
-def first_order_numbers(
-    lens: Lens, wavelength: float, object_distance: float | None = None
-) -> FirstOrderNumbers:
+def first_order_numbers(lens: Lens, where: Conditions) -> FirstOrderNumbers:
     """Return the first-order data of a lens.
 
     Args:
         lens: the lens.
-        wavelength: nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: reference wavelength and object distance.
     """
+    wavelength, object_distance = where.reference_wavelength, where.object_distance
     first = lens.first_order(wavelength, object_distance)
     vertices = lens.system().vertices
     both = []

@@ -364,3 +364,47 @@ def joined_spots(parts: Sequence[SpotRays]) -> SpotRays:
         light=torch.cat([part.light for part in parts]),
         chief=torch.cat(chiefs) if chiefs else None,
     )
+
+
+# The rim of the stop, where a ray is still inside although a fit of its start is not exact.
+_RIM = 1.0 - 2e-4
+_RIM_POINTS = 72
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+def uniform_pupil_points(count: int) -> tuple[Tensor, Tensor]:
+    """Return points that cover the unit disc uniformly, and points on its edge.
+
+    A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
+    exactly zero: ρ² grows evenly and the azimuth by the golden section of the quarter turn (after
+    Vogel, Math. Biosciences 44, 179, 1979).  No two points of a quadrant lie on one circle or one
+    line, so that an aperture that clips the light takes its share of them, wherever its edge runs;
+    points on rings would come and go by whole rings.
+
+    Args:
+        count: points that weigh; a multiple of four.
+
+    Returns:
+        Points (count + 72, 2) and weights (count + 72,) of sum one.  The last 72 lie on the rim and
+        weigh nothing: they are for extents.
+
+    Raises:
+        InputError: the number is not positive or no multiple of four.
+    """
+    if count < 4 or count % 4:
+        raise InputError(f"rays must be a positive multiple of four, not {count}")
+    index = torch.arange(count // 4, dtype=torch.float64)
+    radius = ((index + 0.5) / len(index)).sqrt()
+    angle = 0.5 * math.pi * (index * _GOLDEN).frac()
+    quadrant = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
+    signs = quadrant.new_tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    inner = (signs[:, None] * quadrant).flatten(0, 1)
+    rim = _RIM * circle_points(_RIM_POINTS, 0.0)
+    weight = torch.cat([inner.new_full((count,), 1.0 / count), inner.new_zeros(_RIM_POINTS)])
+    return torch.cat([inner, rim]), weight
+
+
+def circle_points(count: int, offset: float) -> Tensor:
+    """Return points of the unit circle, (count, 2); the first is `offset` steps from +x."""
+    angle = (torch.arange(count, dtype=torch.float64) + offset) * (2.0 * math.pi / count)
+    return torch.stack((angle.cos(), angle.sin()), -1)

@@ -8,13 +8,13 @@ moves its crossing of the stop by some 1e-4 of the stop's semi-diameter or less.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import circle_points
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_line, launch
 from dolens.optics.field_and_aperture import in_double_precision
@@ -30,12 +30,8 @@ from dolens.optics.system import OpticalSystem
 _DEGREE = 8
 # Rings and azimuths of the points that are aimed at; they determine a polynomial of that degree.
 _RINGS, _AZIMUTHS = _DEGREE // 2, 2 * _DEGREE + 1
-# The rim of the stop, where a ray is still inside although the fit is not exact.
-_RIM = 1.0 - 2e-4
-_RIM_POINTS = 72
 # Rays of fans are aimed; one that crosses the very rim is outside the stop's aperture.
 _FAN_RIM = 1.0 - 1e-9
-_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -44,82 +40,34 @@ class RayIntercepts:
     points of the stop.
 
     Attributes:
-        fields: (F, 2), degrees or mm, double precision, on the CPU like all of these.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
-        points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.  On a curved
-            sensor distances from the chief ray's point are those in the plane that touches it
-            there.
+        points: (F, W, N, 2), mm, double precision on the CPU like all of these; NaN where a ray
+            does not pass.  On a curved sensor distances from the chief ray's point are those in
+            the plane that touches it there.
         valid: (F, W, N), bool.
         chief: (F, 2), mm, intercepts of the chief rays of the reference wavelength, whether
             apertures clip them or not; NaN where one does not reach the sensor.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     points: Tensor
     valid: Tensor
     chief: Tensor
 
 
-def uniform_pupil_points(count: int) -> tuple[Tensor, Tensor]:
-    """Return points that cover the unit disc uniformly, and points on its edge.
-
-    A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
-    exactly zero: ρ² grows evenly and the azimuth by the golden section of the quarter turn (after
-    Vogel, Math. Biosciences 44, 179, 1979).  No two points of a quadrant lie on one circle or one
-    line, so that an aperture that clips the light takes its share of them, wherever its edge runs;
-    points on rings would come and go by whole rings.
-
-    Args:
-        count: points that weigh; a multiple of four.
-
-    Returns:
-        Points (count + 72, 2) and weights (count + 72,) of sum one.  The last 72 lie on the rim and
-        weigh nothing: they are for extents.
-
-    Raises:
-        InputError: the number is not positive or no multiple of four.
-    """
-    if count < 4 or count % 4:
-        raise InputError(f"rays must be a positive multiple of four, not {count}")
-    index = torch.arange(count // 4, dtype=torch.float64)
-    radius = ((index + 0.5) / len(index)).sqrt()
-    angle = 0.5 * math.pi * (index * _GOLDEN).frac()
-    quadrant = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
-    signs = quadrant.new_tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    inner = (signs[:, None] * quadrant).flatten(0, 1)
-    rim = _RIM * _circle(_RIM_POINTS, 0.0)
-    weight = torch.cat([inner.new_full((count,), 1.0 / count), inner.new_zeros(_RIM_POINTS)])
-    return torch.cat([inner, rim]), weight
-
-
 @torch.no_grad()
 def trace_ray_intercepts(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    pupil: Tensor,
-    object_distance: float | None = None,
-    exact: bool = False,
+    lens: Lens, where: Conditions, pupil: Tensor, exact: bool = False
 ) -> RayIntercepts:
     """Aim rays at points of the stop, separately for every wavelength, and trace them together.
 
     Args:
         lens: of any precision; the rays are traced in double precision.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths and object distance.
         pupil: (N, 2), x and y on the stop over its semi-diameter, in the unit disc.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Rarely needed:
         exact: aim every ray, rather than to fit a few.
-
-    Raises:
-        InputError: no fields or wavelengths, or fields that are not pairs.
     """
-    launched = launch_through_stop(lens, fields, wavelengths, pupil, object_distance, exact)
+    launched = launch_through_stop(lens, where, pupil, exact)
     system = in_double_precision(lens).system()
     hit, chief = trace_rays(system, launched.rays), trace_rays(system, launched.chief)
     valid = hit.valid & launched.started
@@ -129,9 +77,6 @@ def trace_ray_intercepts(
     if system.image is not None:
         points = _along_surface(system, system.image, hit.position, chief.position, reached)
     return RayIntercepts(
-        launched.fields.cpu(),
-        field_unit(object_distance),
-        launched.wavelengths.cpu(),
         points.where(valid[..., None], math.nan).cpu(),
         valid.cpu(),
         chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
@@ -143,17 +88,13 @@ class StopRays:
     """Holds rays in front of a lens, of F fields and W wavelengths, through N points of the stop.
 
     Attributes:
-        fields: (F, 2), degrees or mm, float64 on the lens's device, as all of these.
-        wavelengths: (W,), nm.
-        rays: (F, W, N), in double precision.
+        rays: (F, W, N), in double precision on the lens's device, as all of these.
         started: (F, W, N), bool: the ray belongs to the field's beam; the numbers of others mean
             nothing.
         chief: (F,), chief rays of the reference wavelength.
         chief_started: (F,), bool.
     """
 
-    fields: Tensor
-    wavelengths: Tensor
     rays: Rays
     started: Tensor
     chief: Rays
@@ -162,31 +103,22 @@ class StopRays:
 
 @torch.no_grad()
 def launch_through_stop(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    pupil: Tensor,
-    object_distance: float | None = None,
-    exact: bool = False,
+    lens: Lens, where: Conditions, pupil: Tensor, exact: bool = False
 ) -> StopRays:
-    """Aim rays at points of the stop, in front of the lens; arguments of `trace_ray_intercepts`.
-
-    Raises:
-        InputError: no fields or wavelengths, or fields that are not pairs.
-    """
+    """Aim rays at points of the stop, in front of the lens; arguments of `trace_ray_intercepts`."""
     lens = in_double_precision(lens)
-    field, waves = as_fields_and_wavelengths(fields, wavelengths, lens.device)
+    field, waves = where.fields.to(lens.device), where.wavelengths.to(lens.device)
     pupil = pupil.to(field)
     count = len(waves)
     # The chief ray of the reference wavelength is always one of the rays.
-    reference = torch.nonzero(waves == lens.primary_wavelength).flatten()
+    reference = torch.nonzero(waves == where.reference_wavelength).flatten()
     at = int(reference[0]) if len(reference) else count
     if at == count:
-        waves = torch.cat([waves, waves.new_tensor([lens.primary_wavelength])])
+        waves = torch.cat([waves, waves.new_tensor([where.reference_wavelength])])
 
     centre = pupil.new_zeros(1, 2)
     nodes = torch.cat([centre, pupil]) if exact else _nodes().to(field)
-    aimed = lens.aim(field[:, None, None], nodes, waves[:, None], object_distance)
+    aimed = lens.aim(field[:, None, None], nodes, waves[:, None], where.object_distance)
     chief_rays = Rays(aimed.position[:, at, 0], aimed.direction[:, at, 0], waves[at])
     if exact:
         rays = Rays(
@@ -194,13 +126,11 @@ def launch_through_stop(
         )
         started = aimed.converged[:, :count, 1:]
     else:
-        rays, started = _fitted(lens, field, aimed, nodes, pupil, object_distance)
+        rays, started = _fitted(where, aimed, nodes, pupil)
         rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:count, None])
         started = started[:, :count, None]
     beam = (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
-    return StopRays(
-        field, waves[:count], rays, started & beam, chief_rays, aimed.converged[:, at, 0]
-    )
+    return StopRays(rays, started & beam, chief_rays, aimed.converged[:, at, 0])
 
 
 def _along_surface(
@@ -213,11 +143,6 @@ def _along_surface(
     planes = TangentPlanes.at(image, there).unsqueeze(1).unsqueeze(1)
     away = points - system.vertices[-1] * points.new_tensor([0.0, 0.0, 1.0]) - planes.point
     return planes.turned(away)[..., :2] + planes.point[..., :2]
-
-
-def field_unit(object_distance: float | None) -> str:
-    """Return the unit of field coordinates: `°` for an object at infinity, else `mm`."""
-    return "°" if vergence(object_distance) == 0.0 else "mm"
 
 
 @dataclass(frozen=True)
@@ -246,39 +171,31 @@ class RayFans:
 
 
 @torch.no_grad()
-def ray_fans(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    count: int = 41,
-    object_distance: float | None = None,
-) -> RayFans:
+def ray_fans(lens: Lens, where: Conditions, count: int = 41) -> RayFans:
     """Trace fans along y and x of the stop: tangential and sagittal for fields in the y-z plane.
 
     Every ray is aimed at its own wavelength.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths and object distance.
         count: points along each diameter; an odd number holds the centre.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Raises:
-        InputError: no fields or wavelengths, or fewer than two points.
+        InputError: fewer than two points.
     """
     if count < 2:
         raise InputError(f"count must be at least 2 points along a diameter, not {count}")
     coordinate = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
     along, across = _FAN_RIM * coordinate, torch.zeros_like(coordinate)
     pupil = torch.cat([torch.stack((across, along), -1), torch.stack((along, across), -1)])
-    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance, exact=True)
+    intercepts = trace_ray_intercepts(lens, where, pupil, exact=True)
     deviation = 1e3 * (intercepts.points - intercepts.chief[:, None, None])
     return RayFans(
-        fields=intercepts.fields,
-        field_unit=intercepts.field_unit,
-        wavelengths=intercepts.wavelengths,
-        reference_wavelength=lens.primary_wavelength,
+        fields=where.fields,
+        field_unit=where.field_unit,
+        wavelengths=where.wavelengths,
+        reference_wavelength=where.reference_wavelength,
         coordinate=coordinate,
         tangential_um=deviation[..., :count, 1],
         sagittal_um=deviation[..., count:, 0],
@@ -286,18 +203,13 @@ def ray_fans(
 
 
 def _fitted(
-    lens: Lens,
-    field: Tensor,
-    aimed: AimedRays,
-    nodes: Tensor,
-    pupil: Tensor,
-    object_distance: float | None,
+    where: Conditions, aimed: AimedRays, nodes: Tensor, pupil: Tensor
 ) -> tuple[Rays, Tensor]:
     """Return rays (F, W, N) from a fit of aimed ones (F, W, nodes), and whether there is a fit, (F,
     W).
     """
-    near = vergence(object_distance)
-    line, _ = field_line(torch.deg2rad(field) if near == 0.0 else field, object_distance)
+    field, near = where.fields.to(pupil), vergence(where.object_distance)
+    line, _ = field_line(torch.deg2rad(field) if near == 0.0 else field, where.object_distance)
     line = line[:, None, None]
     # Where the rays cross the plane that faces the field, in its axes: the inverse of `launch`.
     tilt = line[..., :2] / (1.0 + line[..., 2:])
@@ -322,7 +234,7 @@ def _nodes() -> Tensor:
     for ring in range(_RINGS):
         radius = math.cos(0.5 * math.pi * ring / (_RINGS + 0.5))
         # Every other ring is turned by half a step, so that no azimuth is met by all.
-        rings.append(radius * _circle(_AZIMUTHS, 0.5 * (ring % 2)))
+        rings.append(radius * circle_points(_AZIMUTHS, 0.5 * (ring % 2)))
     return torch.cat(rings)
 
 
@@ -334,9 +246,3 @@ def _basis(points: Tensor) -> Tensor:
         along_x[:, i] * along_y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)
     ]
     return torch.stack(terms, -1)
-
-
-def _circle(count: int, offset: float) -> Tensor:
-    """Return points of the unit circle, (count, 2); the first is `offset` steps from +x."""
-    angle = (torch.arange(count, dtype=torch.float64) + offset) * (2.0 * math.pi / count)
-    return torch.stack((angle.cos(), angle.sin()), -1)

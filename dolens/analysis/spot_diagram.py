@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import spectral_shares
-from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
+from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.errors import InputError
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
@@ -64,57 +65,45 @@ class SpotDiagram:
 
 
 @torch.no_grad()
-def spot_diagram(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    rays: int = 2000,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | Tensor | None = None,
-) -> SpotDiagram:
+def spot_diagram(lens: Lens, where: Conditions, rays: int = 2000) -> SpotDiagram:
     """Trace rays spread uniformly over the stop, at every field and wavelength.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths with their weights, and object distance.
         rays: of each spot, a multiple of four, before apertures clip any.  RMS radii of two
             thousand err by some 1e-4 of themselves where only the stop clips, and by a few
             hundredths at the edge of a field that has lost most of its light.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
+        InputError: a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = uniform_pupil_points(rays)
-    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    intercepts = trace_ray_intercepts(lens, where, pupil)
     points, valid = intercepts.points, intercepts.valid
-    waves = intercepts.wavelengths
-    spectrum = spectral_shares(lens, waves, wavelength_weights)
 
     light = weight * valid
     centroid, mean_square = moments(points, light)
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
-    every = (light * spectrum[:, None]).flatten(1, 2)
+    every = (light * where.weights[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
     return SpotDiagram(
-        fields=intercepts.fields,
-        field_unit=intercepts.field_unit,
-        wavelengths=waves,
-        reference_wavelength=lens.primary_wavelength,
+        fields=where.fields,
+        field_unit=where.field_unit,
+        wavelengths=where.wavelengths,
+        reference_wavelength=where.reference_wavelength,
         intercepts=points,
         valid=valid,
         weight=weight,
-        wavelength_weight=spectrum,
+        wavelength_weight=where.weights,
         chief=intercepts.chief,
         centroid=centroid,
         rms=mean_square.sqrt(),
         geo=extent.where(extent >= 0.0, math.nan),
         polychromatic_centroid=common,
         polychromatic_rms=common_square.sqrt(),
-        airy_radius=AIRY * waves * 1e-6 * working_f_numbers(lens, waves, object_distance),
+        airy_radius=AIRY * where.wavelengths * 1e-6 * working_f_numbers(lens, where),
     )
 
 
@@ -135,12 +124,12 @@ def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
     return centroid, torch.where(there, square, dark).sum((-2, -1))
 
 
-def working_f_numbers(lens: Lens, wavelengths: Tensor, object_distance: float | None) -> Tensor:
-    """Return the paraxial working F-number at each wavelength in nm, (W,), positive."""
+def working_f_numbers(lens: Lens, where: Conditions) -> Tensor:
+    """Return the paraxial working F-number at each wavelength, (W,), positive."""
     system = lens.system()
     numbers = [
-        first_order(system, float(wavelength), object_distance).working_f_number.abs()
-        for wavelength in wavelengths
+        first_order(system, wavelength, where.object_distance).working_f_number.abs()
+        for wavelength in where.wavelengths.tolist()
     ]
     return torch.stack(numbers).detach().double().cpu()
 
@@ -168,53 +157,46 @@ class RMSCurves:
 
 def rms_against_field(
     lens: Lens,
-    wavelengths: Sequence[float] | Tensor,
-    field: Sequence[float] | Tensor | None = None,
+    where: Conditions,
+    edge: Sequence[float] | Tensor | None = None,
     count: int = 15,
     rays: int = 4000,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
 ) -> RMSCurves:
     """Compute RMS spot radii at evenly spaced fields from the axis to an edge.
 
     Args:
         lens: the lens.
-        wavelengths: (W,), nm.
-        field: the edge, (x, y) in degrees or mm; None for the largest of the lens's own fields.
+        where: wavelengths with their weights, of the polychromatic spot, and object distance.
+        edge: (x, y) in degrees or mm; None for the farthest field.
         count: fields, with the axis and the edge.
         rays: of each spot, a multiple of four, before apertures clip any.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of the polychromatic spot, of any sum; None: see
-            `spectral_shares`.
 
     Raises:
-        InputError: no field is given and the lens has none of that kind, or fewer than two are
-            asked for.
+        InputError: fewer than two fields are asked for.
     """
     if count < 2:
         raise InputError(f"count must be at least 2 fields, not {count}")
-    edge = torch.tensor(_largest(lens, object_distance) if field is None else tuple(field))
-    fields = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None] * edge.double()
-    return _curves(lens, fields, wavelengths, rays, object_distance, wavelength_weights)
+    farthest = where.fields[int(where.fields.norm(dim=-1).argmax())]
+    last = farthest if edge is None else torch.as_tensor(edge, dtype=torch.float64)
+    share = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+    return _curves(lens, where.at(share[:, None] * last), rays)
 
 
 def rms_against_wavelength(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
+    where: Conditions,
     interval: tuple[float, float] | None = None,
     count: int = 15,
     rays: int = 4000,
-    object_distance: float | None = None,
 ) -> RMSCurves:
     """Compute RMS spot radii at evenly spaced wavelengths.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        where: fields and object distance.
         interval: shortest and longest wavelength, nm; None for those of the lens.
         count: wavelengths, with both ends.
         rays: of each spot, a multiple of four, before apertures clip any.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Raises:
         InputError: no interval is given and the lens has no wavelengths, or fewer than two are
@@ -227,18 +209,11 @@ def rms_against_wavelength(
             raise InputError(f"lens '{lens.name}' names no wavelengths: give an interval")
         interval = min(lens.wavelengths), max(lens.wavelengths)
     wavelengths = torch.linspace(*interval, count, dtype=torch.float64)
-    return _curves(lens, fields, wavelengths, rays, object_distance, None)
+    return _curves(lens, where.at(wavelengths=wavelengths), rays)
 
 
-def _curves(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    rays: int,
-    object_distance: float | None,
-    wavelength_weights: Sequence[float] | None,
-) -> RMSCurves:
-    spots = spot_diagram(lens, fields, wavelengths, rays, object_distance, wavelength_weights)
+def _curves(lens: Lens, where: Conditions, rays: int) -> RMSCurves:
+    spots = spot_diagram(lens, where, rays)
     return RMSCurves(
         spots.fields,
         spots.field_unit,
@@ -247,10 +222,3 @@ def _curves(
         spots.polychromatic_rms,
         spots.airy_radius,
     )
-
-
-def _largest(lens: Lens, object_distance: float | None) -> tuple[float, float]:
-    kind = "angles" if object_distance is None else "heights"
-    if lens.fields is None or lens.fields.kind != kind:
-        raise InputError(f"lens '{lens.name}' has no fields that are {kind}: give the field's edge")
-    return max(lens.fields.points, key=lambda point: point[0] ** 2 + point[1] ** 2)

@@ -1,13 +1,11 @@
 """A summary tells a lens's first-order data, Seidel sums and spot sizes at a glance."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from dolens.analysis.conditions import FieldPoints, conditions
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.paraxial_data import (
     ABERRATIONS,
     FirstOrderNumbers,
@@ -142,29 +140,13 @@ class LensSummary(FirstOrderNumbers):
 
 
 @torch.no_grad()
-def lens_summary(
-    lens: Lens,
-    fields: FieldPoints | None = None,
-    wavelengths: Sequence[float] | Tensor | None = None,
-    object_distance: float | None = None,
-) -> LensSummary:
-    """Summarise a lens.
-
-    Args:
-        lens: the lens.
-        fields: as `conditions` takes them; None for the lens's own or the defaults.
-        wavelengths: nm; None for the lens's own.
-        object_distance: mm, `inf` for infinity; None for the lens's own.
-
-    Raises:
-        InputError: fields or wavelengths that are none.
-    """
+def lens_summary(lens: Lens, given: Conditions) -> LensSummary:
+    """Summarise a lens at given conditions."""
     exact = in_double_precision(lens)
-    given = conditions(lens, fields, wavelengths, object_distance)
-    spots = spot_diagram(exact, given.fields, given.wavelengths, _RAYS, given.object_distance)
+    spots = spot_diagram(exact, given, _RAYS)
     sums = seidel_sums(exact, given)
     geo = spots.geo[:, spots.wavelength_weight > 0.0].nan_to_num(-math.inf).amax(-1)
-    first = first_order_numbers(exact, given.reference_wavelength, given.object_distance)
+    first = first_order_numbers(exact, given)
     return LensSummary(
         **vars(first),
         name=lens.name,

@@ -1,19 +1,14 @@
 """Wavefronts and pupils of a lens's fields and wavelengths, which several analyses share."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import (
-    as_fields_and_wavelengths,
-    spectral_shares,
-    that_count,
-)
-from dolens.analysis.ray_intercepts import field_unit
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.fields_and_wavelengths import field_unit
 from dolens.diffraction.entrance_beam import EntranceBeam, ObjectPoints, find_beam
 from dolens.diffraction.field_pupil import FieldPupil
 from dolens.diffraction.pupil_fit import dilated
@@ -33,53 +28,36 @@ class FieldWavefronts:
     as a tilt.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
-        weights: (W,), shares of the wavelengths in polychromatic values.
+        where: fields, wavelengths with their weights, and object distance.
         centre: (F, 2), mm on the sensor: the centroid of the polychromatic light.
         wavefront: F·W wavefronts to spheres about `centre`, wavelengths of a field together.
         lit: (F, W), bool: light passes.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
-    weights: Tensor
+    where: Conditions
     centre: Tensor
     wavefront: Wavefront
     lit: Tensor
 
 
 @torch.no_grad()
-def field_wavefronts(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | Tensor | None = None,
-    samples: int = 32,
-) -> FieldWavefronts:
+def field_wavefronts(lens: Lens, where: Conditions, samples: int = 32) -> FieldWavefronts:
     """Trace the wavefronts of every field and wavelength.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
+        where: fields, wavelengths with their weights, and object distance.
         samples: rays along each side of a box about each beam.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or a sphere that cannot be
-            placed.
+        InputError: a sphere that cannot be placed.
     """
     system = lens.system().double()
-    field, waves = as_fields_and_wavelengths(fields, wavelengths, system.device)
-    spectrum = spectral_shares(lens, waves, wavelength_weights).to(field)
+    field, waves = where.fields.to(system.device), where.wavelengths.to(system.device)
+    spectrum = where.weights.to(field)
     shape = (len(field), len(waves))
     every = field.repeat_interleave(len(waves), 0)
-    points = object_points(every, object_distance)
+    points = object_points(every, where.object_distance)
     wave = waves.repeat(len(field))
     beam = find_beam(system, points, wave)
     coarse = _coarse(system, points, wave, beam)
@@ -91,10 +69,7 @@ def field_wavefronts(
     centres = centre.repeat_interleave(len(waves), 0)
     front = pupil_wavefront(system, points, wave, centres, samples, beam=beam)
     return FieldWavefronts(
-        field.cpu(),
-        field_unit(object_distance),
-        waves.cpu(),
-        spectrum.cpu(),
+        where,
         centre.cpu(),
         front,
         (front.flux > 0.0).unflatten(0, shape).cpu(),
@@ -148,43 +123,33 @@ class PreparedPupils:
 
 @torch.no_grad()
 def prepare_pupils(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    most_samples: int = _MOST_SAMPLES,
+    lens: Lens, where: Conditions, most_samples: int = _MOST_SAMPLES
 ) -> PreparedPupils:
     """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
 
     Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
     """
-    waves, shares = that_count(lens, wavelengths, wavelength_weights)
-    found = field_wavefronts(lens, fields, waves, object_distance, shares)
-    return PreparedPupils(found, _field_pupils(lens, found, object_distance, most_samples))
+    found = field_wavefronts(lens, where.that_count())
+    return PreparedPupils(found, _field_pupils(lens, found, most_samples))
 
 
-def _field_pupils(
-    lens: Lens,
-    found: FieldWavefronts,
-    object_distance: float | None,
-    most_samples: int = _MOST_SAMPLES,
-) -> list[FieldPupil | None]:
+def _field_pupils(lens: Lens, found: FieldWavefronts, most_samples: int) -> list[FieldPupil | None]:
     """Return the pupils of every field, None for a field without light.
 
     Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
     """
     system = lens.system().double()
-    count = len(found.wavelengths)
-    weights = found.weights.to(system.device)
+    where = found.where
+    count = len(where.wavelengths)
+    weights = where.weights.to(system.device)
     pupils: list[FieldPupil | None] = []
     for number, lit in enumerate(found.lit.any(1).tolist()):
         if not lit:
             pupils.append(None)
             continue
         which = torch.arange(number * count, (number + 1) * count, device=system.device)
-        field = found.fields[number].to(system.device).expand(count, 2)
-        point = object_points(field, object_distance)
+        field = where.fields[number].to(system.device).expand(count, 2)
+        point = object_points(field, where.object_distance)
         front = part_of(found.wavefront, which)
         pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
     return pupils

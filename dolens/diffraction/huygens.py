@@ -18,8 +18,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import that_count
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.modulation_transfer import field_directions
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points, part_of
 from dolens.diffraction.modulation_transfer import DiffractionModulation
@@ -69,10 +70,7 @@ def huygens_irradiance(
 @torch.no_grad()
 def huygens_point_spread(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    where: Conditions,
     cells: int = 64,
     half_width_um: float | None = None,
     rays: int | None = None,
@@ -83,25 +81,21 @@ def huygens_point_spread(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
+        where: fields, wavelengths with their weights, and object distance.
         cells: M, along each side of the window; the irradiance is that at their centres.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
         rays: along each side of a box about each beam; None: so many that the phases of neighbours
             differ by half a turn at most, 128 or more.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, fewer than two cells, too few
-            rays for the phases of neighbours to differ by less than half a turn, or more than can
-            be added up.
+        InputError: fewer than two cells, too few rays for the phases of neighbours to differ by
+            less than half a turn, or more than can be added up.
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
-    waves, shares = that_count(lens, wavelengths, wavelength_weights)
-    found = field_wavefronts(lens, fields, waves, object_distance, shares)
-    weights = found.weights.to(lens.device)
+    where = where.that_count()
+    found = field_wavefronts(lens, where)
+    weights = where.weights.to(lens.device)
     rows = []
     for number, lit in enumerate(found.lit.any(1).tolist()):
         if not lit:
@@ -110,7 +104,9 @@ def huygens_point_spread(
         which = number * len(weights) + torch.arange(len(weights), device=lens.device)
         front = part_of(found.wavefront, which)
         half = 1e-3 * half_width_um if half_width_um else _half_width(front, weights)
-        sums = _Wavelets(lens, found.fields[number], object_distance, front, weights, half)
+        field = where.fields[number].to(weights).expand(len(weights), 2)
+        points = object_points(field, where.object_distance)
+        sums = _Wavelets(lens, points, front, weights, half)
         finer = sums.rays(rays, cells)
         grid = (torch.arange(cells).to(weights) + 0.5) * (2.0 * half / cells) - half
         irradiance, perfect = sums.added(finer, grid, grid)
@@ -122,28 +118,21 @@ def huygens_point_spread(
         strehl = highest / float(perfect)
         window = 1e-6 * irradiance
         rows.append(FieldPointSpread(1e3 * half, window, held, strehl, True, reason, error))
-    return of_all_fields(found, airy_radius_um(lens, found, object_distance), rows)
+    return of_all_fields(found, airy_radius_um(lens, where), rows)
 
 
 @torch.no_grad()
-def huygens_window(
-    lens: Lens,
-    field: Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-) -> tuple[float, float]:
-    """Return the half width of a field's window, and the Airy radius, both in µm.
+def huygens_window(lens: Lens, where: Conditions) -> tuple[float, float]:
+    """Return the half width of the window of one field, and the Airy radius, both in µm.
 
-    Arguments are those of `huygens_point_spread`, of one field (2,).  Without light both are those
-    of a perfect lens.
+    Arguments are those of `huygens_point_spread`.  Without light both are those of a perfect lens.
     """
-    waves, shares = that_count(lens, wavelengths, wavelength_weights)
-    found = field_wavefronts(lens, field[None], waves, object_distance, shares)
-    airy = airy_radius_um(lens, found, object_distance)
+    where = where.that_count()
+    found = field_wavefronts(lens, where)
+    airy = airy_radius_um(lens, where)
     if not bool(found.lit.any()):
         return airy, airy
-    return 1e3 * _half_width(found.wavefront, found.weights.to(lens.device)), airy
+    return 1e3 * _half_width(found.wavefront, where.weights.to(lens.device)), airy
 
 
 def _half_width(front: Wavefront, weights: Tensor) -> float:
@@ -156,15 +145,13 @@ class _Wavelets:
     def __init__(
         self,
         lens: Lens,
-        field: Tensor,
-        object_distance: float | None,
+        points: ObjectPoints,
         front: Wavefront,
         weights: Tensor,
         half: float,
     ) -> None:
-        self.system, self.front, self.weights, self.half = lens.system(), front, weights, half
-        count = len(weights)
-        self.points = object_points(field.to(weights).expand(count, 2), object_distance)
+        self.system, self.points, self.front = lens.system(), points, front
+        self.weights, self.half = weights, half
 
     def rays(self, given: int | None, cells: int) -> int:
         """Return the rays along each side.
@@ -234,12 +221,7 @@ _AIRY_RADII, _STEPS = 4.0, 3.0
 
 @torch.no_grad()
 def huygens_modulation(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    frequencies: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    lens: Lens, where: Conditions, frequencies: Sequence[float] | Tensor
 ) -> DiffractionModulation:
     """Compute the polychromatic MTF from sums of Huygens's wavelets.
 
@@ -250,11 +232,8 @@ def huygens_modulation(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths with their weights, and object distance.
         frequencies: (Q,), cycles/mm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Returns:
         The curves; the limits, which need a second pupil, are NaN.
@@ -263,19 +242,17 @@ def huygens_modulation(
         InputError: as `huygens_point_spread`.
     """
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu().reshape(-1)
-    points = torch.as_tensor(fields, dtype=torch.float64).cpu()
-    arguments = wavelengths, object_distance, wavelength_weights
-    along = field_directions(points, object_distance)
     unknown = torch.full_like(frequency, math.nan)
     curves: list[Tensor] = []
     errors: list[float] = []
     diffraction: list[bool] = []
     reasons: list[str] = []
-    for field, way in zip(points, along, strict=True):
-        half, airy = huygens_window(lens, field, *arguments)
+    for field, way in zip(where.fields, field_directions(where), strict=True):
+        here = where.at(field[None])
+        half, airy = huygens_window(lens, here)
         half += _AIRY_RADII * airy
         cells = math.ceil(2.0 * half * _STEPS / airy)
-        found = huygens_point_spread(lens, field[None], *arguments, cells, half)
+        found = huygens_point_spread(lens, here, cells, half)
         reasons += found.reasons
         diffraction += found.diffraction
         if not found.diffraction[0]:
@@ -286,10 +263,10 @@ def huygens_modulation(
         curves.append(_transform(found.irradiance[0], float(found.half_width_um), frequency, ways))
         errors.append(float(found.sampling_error) + abs(1.0 - float(found.held)))
     tangential, sagittal = torch.stack(curves, 1)
-    limit = unknown.expand(len(points), -1)
+    limit = unknown.expand(len(where.fields), -1)
     return DiffractionModulation(
-        points,
-        found.field_unit,
+        where.fields,
+        where.field_unit,
         found.wavelengths,
         frequency,
         tangential,

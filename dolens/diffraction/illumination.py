@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import FieldScan
+from dolens.analysis.conditions import FieldScan, conditions
 from dolens.diffraction.field_wavefronts import field_wavefronts
 from dolens.optics.lens import Lens
 
@@ -34,11 +34,7 @@ class Illumination:
 
 @torch.no_grad()
 def relative_illumination(
-    lens: Lens,
-    scan: FieldScan,
-    wavelength: float | None = None,
-    object_distance: float | None = None,
-    samples: int = 48,
+    lens: Lens, scan: FieldScan, wavelength: float | None = None, samples: int = 48
 ) -> Illumination:
     """Compute the relative illumination of a lens, vignetting included.
 
@@ -50,18 +46,20 @@ def relative_illumination(
         lens: the lens.
         scan: fields on a line through the axis (see `field_scans`).
         wavelength: nm; None for the lens's reference wavelength.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
         samples: rays along each side of a box about each beam.
     """
     wavelength = wavelength or lens.primary_wavelength
     fields = torch.cat([torch.zeros(1, 2, dtype=torch.float64), scan.fields])
-    found = field_wavefronts(lens, fields, [wavelength], object_distance, samples=samples)
+    distance = scan.object_distance
+    found = field_wavefronts(
+        lens, conditions(lens, fields, wavelength, distance or torch.inf), samples
+    )
     front = found.wavefront
     area = (front.area * front.coverage).sum((-2, -1)).cpu()
     height = (found.centre - found.centre[0]).norm(dim=-1)
     slopes = torch.deg2rad(scan.fields).tan()
-    if object_distance is not None:
-        slopes = scan.fields / object_distance
+    if distance is not None:
+        slopes = scan.fields / distance
     return Illumination(
         scan,
         float(wavelength),

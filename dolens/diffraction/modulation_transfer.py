@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.modulation_transfer import field_directions
 from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
@@ -54,11 +55,8 @@ class DiffractionModulation:
 @torch.no_grad()
 def diffraction_modulation(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
+    where: Conditions,
     frequencies: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
     prepared: PreparedPupils | None = None,
 ) -> DiffractionModulation:
     """Compute the polychromatic MTF with diffraction.
@@ -68,25 +66,17 @@ def diffraction_modulation(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths with their weights, and object distance.
         frequencies: (Q,), cycles/mm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.
-
-    Raises:
-        InputError: no fields or wavelengths, or weights that do not fit.
     """
-    prepared = prepared or prepare_pupils(
-        lens, fields, wavelengths, object_distance, wavelength_weights, _MOST_SAMPLES
-    )
+    prepared = prepared or prepare_pupils(lens, where, _MOST_SAMPLES)
     found, pupils = prepared.wavefronts, prepared.pupils
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
-    along = field_directions(found.fields, object_distance).to(lens.device)
+    along = field_directions(found.where).to(lens.device)
     rows, errors = [], []
     for pupil, way in zip(pupils, along, strict=True):
         if pupil is None:
@@ -99,9 +89,9 @@ def diffraction_modulation(
         errors.append(float((found_here.abs() - coarser.abs()).abs().amax()))
     tangential, sagittal, *limits = torch.stack(rows, 1).cpu()
     return DiffractionModulation(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
+        found.where.fields,
+        found.where.field_unit,
+        found.where.wavelengths,
         frequency.cpu(),
         tangential,
         sagittal,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import FieldScan
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
@@ -93,9 +93,9 @@ def of_all_fields(
         return torch.tensor(list(values), dtype=torch.float64)
 
     return PointSpread(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
+        found.where.fields,
+        found.where.field_unit,
+        found.where.wavelengths,
         found.centre,
         numbers(row.half_width_um for row in rows),
         torch.stack([row.irradiance.cpu() for row in rows]),
@@ -111,10 +111,7 @@ def of_all_fields(
 @torch.no_grad()
 def point_spread(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
+    where: Conditions,
     cells: int = _CELLS,
     half_width_um: float | None = None,
     prepared: PreparedPupils | None = None,
@@ -126,10 +123,7 @@ def point_spread(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
+        where: fields, wavelengths with their weights, and object distance.
         cells: M, along each side of the window.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
 
@@ -137,13 +131,11 @@ def point_spread(
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or fewer than two cells.
+        InputError: fewer than two cells, or a window without width.
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
-    prepared = prepared or prepare_pupils(
-        lens, fields, wavelengths, object_distance, wavelength_weights
-    )
+    prepared = prepared or prepare_pupils(lens, where)
     rows = []
     for pupil in prepared.pupils:
         if pupil is None:
@@ -155,18 +147,15 @@ def point_spread(
         how = pupil.diffraction, pupil.reason, _sampling_error(pupil, half, cells)
         row = FieldPointSpread(1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how)
         rows.append(row)
-    airy = airy_radius_um(lens, prepared.wavefronts, object_distance)
+    airy = airy_radius_um(lens, prepared.wavefronts.where)
     return of_all_fields(prepared.wavefronts, airy, rows)
 
 
 @torch.no_grad()
 def diffraction_encircled_energy(
     lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
+    where: Conditions,
     radii_um: Sequence[float] | Tensor | None = None,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
     prepared: PreparedPupils | None = None,
 ) -> EncircledEnergy:
     """Compute encircled energy with diffraction, by sums over the point spread function.
@@ -176,24 +165,19 @@ def diffraction_encircled_energy(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
+        where: fields, wavelengths with their weights, and object distance.
         radii_um: (Q,), µm, ascending, from the centroid; None for 101 from zero to the edge of the
             largest window of `point_spread`.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-        wavelength_weights: (W,), of any sum; None: see `spectral_shares`.
 
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or radii that do not ascend.
+        InputError: radii that do not ascend.
     """
-    prepared = prepared or prepare_pupils(
-        lens, fields, wavelengths, object_distance, wavelength_weights
-    )
+    prepared = prepared or prepare_pupils(lens, where)
     found, pupils = prepared.wavefronts, prepared.pupils
-    airy = airy_radius_um(lens, found, object_distance)
+    airy = airy_radius_um(lens, found.where)
     if radii_um is None:
         reach = max((window_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
         radii_um = torch.linspace(0.0, 1e3 * reach, 101, dtype=torch.float64)
@@ -203,9 +187,9 @@ def diffraction_encircled_energy(
         for pupil in pupils
     ]
     return EncircledEnergy(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
+        found.where.fields,
+        found.where.field_unit,
+        found.where.wavelengths,
         radii,
         torch.stack(curves).cpu(),
         airy,
@@ -281,10 +265,10 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     return torch.stack(found)
 
 
-def airy_radius_um(lens: Lens, found: FieldWavefronts, object_distance: float | None) -> float:
+def airy_radius_um(lens: Lens, where: Conditions) -> float:
     """Return 1.22·λ·N, µm, with the paraxial working F-number, mean over wavelengths."""
-    numbers = working_f_numbers(lens, found.wavelengths, object_distance)
-    return float(found.weights @ (1e-3 * AIRY * found.wavelengths * numbers))
+    radii = 1e-3 * AIRY * where.wavelengths * working_f_numbers(lens, where)
+    return float(where.weights @ radii)
 
 
 # Of a point spread function's window, whose peak alone counts.
@@ -316,34 +300,26 @@ class StrehlRatios:
 
 
 @torch.no_grad()
-def strehl_ratios(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | FieldScan | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-) -> StrehlRatios:
+def strehl_ratios(lens: Lens, where: Conditions) -> StrehlRatios:
     """Compute Strehl ratios of every field and wavelength in both ways.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them, or a scan of them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: fields, wavelengths and object distance.
 
     Raises:
-        InputError: no fields or wavelengths, or a sphere that cannot be placed.
+        InputError: a sphere that cannot be placed.
     """
-    points = fields.fields if isinstance(fields, FieldScan) else fields
-    errors = wavefront_errors(lens, points, wavelengths, object_distance)
+    errors = wavefront_errors(lens, where)
     peak, sampling = [], []
-    for wavelength in errors.wavelengths.tolist():
-        found = point_spread(lens, points, [wavelength], object_distance, cells=_PEAK_CELLS)
+    for wavelength in where.wavelengths.tolist():
+        found = point_spread(lens, where.at(wavelengths=wavelength), cells=_PEAK_CELLS)
         peak.append(found.strehl_ratio)
         sampling.append(found.sampling_error)
     return StrehlRatios(
-        errors.fields,
-        errors.field_unit,
-        errors.wavelengths,
+        where.fields,
+        where.field_unit,
+        where.wavelengths,
         torch.stack(peak, -1),
         marechal(errors.rms),
         torch.stack(sampling, -1),

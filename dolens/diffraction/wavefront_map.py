@@ -1,13 +1,11 @@
 """Wavefront errors: maps over the stop, Zernike coefficients, RMS and peak to valley."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
-from dolens.analysis.ray_intercepts import field_unit
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.zernike_fit import TERMS, ZernikeFit, zernike_fit
 from dolens.diffraction.entrance_beam import (
     EntranceBeam,
@@ -89,29 +87,21 @@ class WavefrontMaps:
 
 
 @torch.no_grad()
-def wavefront_maps(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    samples: int = 64,
-) -> WavefrontMaps:
+def wavefront_maps(lens: Lens, where: Conditions, samples: int = 64) -> WavefrontMaps:
     """Trace the wavefront error of every field and wavelength; see `WavefrontMaps`.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: fields, wavelengths and object distance.
         samples: S, rays along each side of a box about each beam.
 
     Raises:
-        InputError: no fields or wavelengths, or a sphere that cannot be placed.
+        InputError: a sphere that cannot be placed.
     """
     system = lens.system().double()
-    field, waves = as_fields_and_wavelengths(fields, wavelengths, system.device)
+    field, waves = where.fields.to(system.device), where.wavelengths.to(system.device)
     shape = (len(field), len(waves))
-    points = object_points(field.repeat_interleave(len(waves), 0), object_distance)
+    points = object_points(field.repeat_interleave(len(waves), 0), where.object_distance)
     wave = waves.repeat(len(field))
     beam = find_beam(system, points, wave)
     centre, reached = find_chief_rays(system, points, wave)
@@ -130,9 +120,9 @@ def wavefront_maps(
         return values.cpu().unflatten(0, shape)
 
     return WavefrontMaps(
-        field.cpu(),
-        field_unit(object_distance),
-        waves.cpu(),
+        where.fields,
+        where.field_unit,
+        where.wavelengths,
         found(stop),
         found(error.where(weight > 0.0, torch.nan)),
         found(weight),
@@ -179,13 +169,7 @@ class WavefrontErrors:
 
 
 @torch.no_grad()
-def wavefront_errors(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    samples: int = 64,
-) -> WavefrontErrors:
+def wavefront_errors(lens: Lens, where: Conditions, samples: int = 64) -> WavefrontErrors:
     """Compute RMS wavefront error, peak to valley and Strehl ratio on the sensor.
 
     Tilt, which only moves the image point, is removed by least squares over the pupil.  The Strehl
@@ -193,15 +177,13 @@ def wavefront_errors(
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
-        wavelengths: (W,), nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: fields, wavelengths and object distance.
         samples: rays along each side of a box about each beam.
 
     Raises:
-        InputError: no fields or wavelengths, or a sphere that cannot be placed.
+        InputError: a sphere that cannot be placed.
     """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, samples=samples)
+    found = field_wavefronts(lens, where, samples)
     front, shape = found.wavefront, found.lit.shape
     weight = front.weight.flatten(1)
     share = (weight / weight.sum(1, keepdim=True)).nan_to_num(0.0)
@@ -220,9 +202,9 @@ def wavefront_errors(
         return of.cpu().unflatten(0, shape).where(found.lit, torch.nan)
 
     return WavefrontErrors(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
+        where.fields,
+        where.field_unit,
+        where.wavelengths,
         values((share * error.square()).sum(1).sqrt()),
         values((high - low).clamp(min=0.0)),
         values(real.square() + imaginary.square()),

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from dolens.analysis.conditions import Conditions, conditions, field_points
-from dolens.analysis.fields_and_wavelengths import as_wavelengths, spectral_shares
+from dolens.analysis.conditions import Conditions, conditions
+from dolens.analysis.fields_and_wavelengths import as_wavelengths, field_points, spectral_shares
 from dolens.analysis.paraxial_data import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
@@ -78,9 +78,7 @@ def lens_overview(lens: Lens) -> Overview:
     found: list[SpotDiagram] = []
 
     def spots() -> Table:
-        found.append(
-            spot_diagram(lens, where.fields, where.wavelengths, _RAYS, where.object_distance)
-        )
+        found.append(spot_diagram(lens, where, _RAYS))
         return spot_radii_table(found[0])
 
     sections = [TableSection("Prescription", prescription_tables(lens))]
@@ -99,7 +97,7 @@ def lens_overview(lens: Lens) -> Overview:
 
 def summary(lens: Lens, where: Conditions) -> str:
     """Return focal length, F-number, fields and wavelengths of a lens in one line."""
-    first = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
+    first = first_order_numbers(lens, where)
     if first.sections:
         parts = [f"{_focal_length(own.efl)} in {own.name}" for own in first.sections]
     else:
@@ -205,7 +203,7 @@ def published_table(lens: Lens, where: Conditions) -> Table:
         where: its conditions.
     """
     published = lens.published or Published()
-    found = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
+    found = first_order_numbers(lens, where)
     computed = {
         "efl": abs(found.efl),
         "f_number": abs(found.f_number),
@@ -262,7 +260,7 @@ def states_table(lens: Lens) -> Table:
             where = conditions(there)
         except InputError as error:
             raise InputError(f"state '{name}': {error}") from None
-        first = first_order_numbers(there, where.reference_wavelength, where.object_distance)
+        first = first_order_numbers(there, where)
         edge = max(math.hypot(*point) for point in where.fields.tolist())
         distance = math.inf if where.object_distance is None else where.object_distance
         efl = None if there.published is None else there.published.efl

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -45,10 +45,6 @@ class Written:
 def write_page(
     lens: Lens,
     path: str | Path | None,
-    fields: Sequence[Sequence[float]] | None = None,
-    wavelengths: Sequence[float] | None = None,
-    f_number: float | None = None,
-    entrance_pupil_diameter: float | None = None,
     tolerances: str | Path | None = None,
     figures: str | Path | None = None,
     command: str = "",
@@ -60,12 +56,8 @@ def write_page(
     no network.  What cannot be computed is named on the page, with the reason, in its place.
 
     Args:
-        lens: stays as it is.
+        lens: stays as it is; `prepared_lens` gives one other fields, wavelengths or aperture.
         path: the page's file; None writes figures only.
-        fields: (x, y) of each, degrees for an object at infinity, else mm; None for the lens's own.
-        wavelengths: nm; None for the lens's own.
-        f_number: sets the stop; or
-        entrance_pupil_diameter: mm, sets the stop.
         tolerances: `default`, or a file of tolerances (see `dolens.prescriptions.files`), adds the
             worst offenders; None leaves them out.
         figures: a folder that gets every figure as PNG and SVG.
@@ -77,9 +69,10 @@ def write_page(
     Tables list all fields; figures show nine of them at most, and the heading says which.
 
     Raises:
-        InputError: a setting is out of range, or a file cannot be written.
+        InputError: the lens names conditions that no analysis can take, or a file cannot be
+            written.
     """
-    lens = prepared_lens(lens, fields, wavelengths, f_number, entrance_pupil_diameter)
+    lens = prepared_lens(lens)
     overview = lens_overview(lens)
     shown, about = _with_few_fields(lens, overview)
     listed = PageSections(shown, about, tolerances).sections()

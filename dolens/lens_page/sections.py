@@ -141,24 +141,12 @@ class PageSections:
         """Return fields along lines through the axis."""
         return field_scans(self.lens, self.distance)
 
-    @property
-    def scene(self) -> tuple[Tensor, Tensor]:
-        """Return fields and wavelengths, as most analyses take them."""
-        return self.where.fields, self.where.wavelengths
-
     def layout(self) -> Content:
         """Draw the lens in section."""
         where = self.where
         beside = int((where.fields[:, 0] != 0.0).sum())
-        fields = where.fields if beside < len(where.fields) else where.fields.new_zeros(1, 2)
-        figure = lens_section_figure(
-            self.lens,
-            fields,
-            where.wavelengths,
-            where.field_unit,
-            where.object_distance,
-            title="",
-        )
+        drawn = where if beside < len(where.fields) else where.at(0.0)
+        figure = lens_section_figure(self.lens, drawn, title="")
         note = f"Rays at {where.reference_wavelength:g} nm."
         if beside:
             note += " Fields beside the y-z plane are drawn in space only."
@@ -189,16 +177,14 @@ class PageSections:
 
     def fans(self) -> Content:
         """Plot ray fans."""
-        fans = ray_fans(self.lens, *self.scene, object_distance=self.distance)
+        fans = ray_fans(self.lens, self.where)
         return Content({"ray_fans": ray_fans_figure(fans, title="")})
 
     def mtf(self) -> Content:
         """Plot the MTF with diffraction, and that of rays alone."""
-        frequencies = frequency_range(self.lens, *self.scene, self.distance)
-        wave = diffraction_modulation(
-            self.lens, *self.scene, frequencies, self.distance, prepared=self._pupils
-        )
-        rays = modulation(self.lens, *self.scene, frequencies, _MTF_RAYS, self.distance)
+        frequencies = frequency_range(self.lens, self.where)
+        wave = diffraction_modulation(self.lens, self.where, frequencies, self._pupils)
+        rays = modulation(self.lens, self.where, frequencies, _MTF_RAYS)
         figure = modulation_comparison_figure(wave, rays, title="")
         return Content(
             {"mtf": figure},
@@ -217,11 +203,11 @@ class PageSections:
 
     @cached_property
     def _spread(self) -> PointSpread:
-        return point_spread(self.lens, *self.scene, self.distance, prepared=self._pupils)
+        return point_spread(self.lens, self.where, prepared=self._pupils)
 
     @cached_property
     def _pupils(self) -> PreparedPupils:
-        return prepare_pupils(self.lens, *self.scene, self.distance)
+        return prepare_pupils(self.lens, self.where)
 
     def _by_rays(self, diffraction: Sequence[bool], reasons: Sequence[str]) -> list[str]:
         """Say of which fields rays alone make the image, and why."""
@@ -236,41 +222,34 @@ class PageSections:
 
     def energy(self) -> Content:
         """Plot encircled energy with diffraction, and that of rays."""
-        wave = diffraction_encircled_energy(
-            self.lens, *self.scene, object_distance=self.distance, prepared=self._pupils
-        )
-        rays = encircled_energy(
-            self.lens, *self.scene, wave.radii_um, object_distance=self.distance
-        )
+        wave = diffraction_encircled_energy(self.lens, self.where, prepared=self._pupils)
+        rays = encircled_energy(self.lens, self.where, wave.radii_um)
         return Content({"encircled_energy": encircled_energy_figure(wave, rays, title="")})
 
     def field_curves(self) -> Content:
         """Plot field curvature and distortion."""
         waves = self.where.wavelengths
-        curves = [field_curves(self.lens, scan, waves, self.distance) for scan in self.scans]
+        curves = [field_curves(self.lens, scan, waves) for scan in self.scans]
         tables = [] if self.distance is not None else [distortion_table(self.lens, self.scans)]
         return Content({"field_curves": field_curves_figure(curves, title="")}, tables)
 
     def colour(self) -> Content:
         """Plot lateral colour, and the focus against the wavelength."""
         waves = spectral_lines(self.lens)
-        curves = [lateral_colour(self.lens, scan, waves, self.distance) for scan in self.scans]
+        curves = [lateral_colour(self.lens, scan, waves) for scan in self.scans]
         shift = chromatic_focal_shift(self.lens, object_distance=self.distance)
         return Content({"lateral_colour": lateral_colour_figure(curves, shift, title="")})
 
     def light(self) -> Content:
         """Plot relative illumination."""
-        found = [
-            relative_illumination(self.lens, scan, object_distance=self.distance)
-            for scan in self.scans
-        ]
+        found = [relative_illumination(self.lens, scan) for scan in self.scans]
         return Content({"relative_illumination": illumination_figure(found, title="")})
 
     def wavefront(self) -> Content:
         """Show wavefront maps, and list errors, Strehl ratios and Zernike coefficients."""
-        found = wavefront_errors(self.lens, *self.scene, self.distance)
+        found = wavefront_errors(self.lens, self.where)
         wave = self.where.reference_wavelength
-        maps = wavefront_maps(self.lens, self.where.fields, [wave], self.distance)
+        maps = wavefront_maps(self.lens, self.where.at(wavelengths=wave))
         note = (
             f"At {wave:g} nm, about the chief ray's point of the sensor; positive where the "
             "wavefront is ahead of the reference sphere."
@@ -280,26 +259,18 @@ class PageSections:
 
     def footprint(self) -> Content:
         """Show where the beams meet the surfaces."""
-        found = footprint(self.lens, self.where.fields, None, _FOOTPRINT_RAYS, self.distance)
+        found = footprint(self.lens, self.where, rays=_FOOTPRINT_RAYS)
         note = f"Rays at {found.wavelength:g} nm, spread evenly over the stop."
         return Content({"footprints": footprint_figure(found, title="")}, note=note)
 
     def rms(self) -> Content:
         """Plot RMS radii."""
         where = self.where
-        reach = where.fields[int(where.fields.norm(dim=-1).argmax())].tolist()
         against_field = None
-        if any(reach):
-            against_field = rms_against_field(
-                self.lens, where.wavelengths, reach, rays=_RMS_RAYS, object_distance=self.distance
-            )
+        if bool(where.fields.any()):
+            against_field = rms_against_field(self.lens, where, rays=_RMS_RAYS)
         against_wavelength = rms_against_wavelength(
-            self.lens,
-            where.fields,
-            wavelength_interval(self.lens),
-            count=11,
-            rays=_RMS_RAYS,
-            object_distance=self.distance,
+            self.lens, where, wavelength_interval(self.lens), count=11, rays=_RMS_RAYS
         )
         figure = rms_curves_figure(against_field, against_wavelength, title="")
         return Content({"rms": figure})
@@ -383,7 +354,7 @@ def distortion_table(lens: Lens, scans: Sequence[FieldScan]) -> Table:
     some = torch.arange(len(scan.fields) - 1, 0, -_SOME).flip(0)
     some = some[scan.coordinate[some] != 0.0]
     columns = [
-        image_displacement(lens, scan, [lens.primary_wavelength], None, name).distortion[some, 0]
+        image_displacement(lens, scan, [lens.primary_wavelength], name).distortion[some, 0]
         for name in DISTORTION_REFERENCES
     ]
     rows = [

@@ -187,7 +187,7 @@ def elements_table(lens: Lens) -> Table | None:
 
 def first_order_table(lens: Lens, where: Conditions) -> Table:
     """Return first-order data at the reference wavelength."""
-    found = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
+    found = first_order_numbers(lens, where)
     return Table(
         ("first order", "value", "unit"),
         [

@@ -139,7 +139,7 @@ def lens_colour(lens: Lens) -> LensColour | None:
         1e3 * float(first_order(system, w, where.object_distance).image) for w in lines
     )
     (scan,) = field_scans(lens, where.object_distance)
-    shift = lateral_colour(lens, scan, (lines[0], lines[2]), where.object_distance).shift_um
+    shift = lateral_colour(lens, scan, (lines[0], lines[2])).shift_um
     lateral = (shift[:, 1] - shift[:, 0]).abs().nan_to_num().amax()
     return LensColour(red - blue, 0.5 * (red + blue) - middle, float(lateral))
 

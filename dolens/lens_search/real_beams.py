@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan, conditions, field_scans
-from dolens.analysis.ray_intercepts import launch_through_stop, uniform_pupil_points
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
+from dolens.analysis.ray_intercepts import launch_through_stop
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
@@ -98,7 +99,7 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     weight = torch.cat([weight.new_zeros(1), weight])
     reference = where.reference_wavelength
     waves = where.wavelengths
-    launched = launch_through_stop(lens, scan.fields, waves, pupil, where.object_distance)
+    launched = launch_through_stop(lens, where.at(scan.fields), pupil)
     hit = trace_rays(system, launched.rays, 1.0, True)
     assert hit.points is not None  # they were recorded
     failed = ~(arrives(hit.status) & launched.started)

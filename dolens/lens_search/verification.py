@@ -313,7 +313,7 @@ def _image(
 ) -> list[Check]:
     scan, distance = beams.scan, where.object_distance
     first = lens.first_order(where.reference_wavelength, distance)
-    chief = parabasal_rays(lens, scan.fields, [where.reference_wavelength], distance)
+    chief = parabasal_rays(lens, scan, [where.reference_wavelength])
     height = chief.position[:, 0] @ scan.direction
     if distance is None:
         ideal = float(first.efl) * torch.deg2rad(scan.coordinate).tan()
@@ -321,16 +321,7 @@ def _image(
         ideal = float(first.magnification) * scan.coordinate
     distortion = torch.where(ideal == 0.0, 0.0, 100.0 * (height / ideal - 1.0))
     angle = torch.rad2deg(chief.slope[:, 0].norm(dim=-1).atan())
-    edge = tuple(scan.fields[-1].tolist())
-    spots = rms_against_field(
-        lens,
-        beams.wavelengths,
-        edge,
-        len(scan.fields),
-        rays,
-        distance,
-        where.weights.tolist(),
-    )
+    spots = rms_against_field(lens, where, scan.fields[-1], len(scan.fields), rays)
     rows = (
         ("distortion", distortion, "%", required.distortion),
         ("chief-ray angle", angle, "°", required.chief_ray_angle),

@@ -1,11 +1,11 @@
 """Automatic semi-diameters give each surface the clear aperture that its light needs."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
@@ -34,9 +34,7 @@ class RimRays(NamedTuple):
 
 
 @torch.no_grad()
-def rim_rays(
-    lens: Lens, fields: Sequence[Sequence[float]], wavelengths: Sequence[float]
-) -> RimRays:
+def rim_rays(lens: Lens, where: Conditions) -> RimRays:
     """Return the rays of fields and wavelengths that are aimed at the rim of the stop, where they
     can be.
 
@@ -45,16 +43,14 @@ def rim_rays(
 
     Args:
         lens: with a circular stop.
-        fields: (x, y) of each, degrees or mm.
-        wavelengths: nm.
+        where: fields, wavelengths and object distance.
     """
     angle = torch.arange(_RIM, dtype=torch.float64) * (2.0 * torch.pi / _RIM)
     rim = torch.stack((angle.cos(), angle.sin()), -1).to(lens.sensor_distance)
-    places = torch.tensor([tuple(field) for field in fields], dtype=torch.float64)
-    waves = torch.tensor(list(wavelengths), dtype=torch.float64, device=lens.device)
+    places, waves = where.fields, where.wavelengths.to(lens.device)
     grid = places.to(lens.sensor_distance)[:, None, None].expand(-1, len(waves), _RIM, 2)
     wave = waves[None, :, None].expand(grid.shape[:-1])
-    aimed = lens.aim(grid, rim.expand_as(grid), wave, lens.object_distance)
+    aimed = lens.aim(grid, rim.expand_as(grid), wave, where.object_distance)
     spot = torch.arange(len(places) * len(waves), device=lens.device)
     spot = spot.reshape(len(places), len(waves), 1).expand(grid.shape[:-1])
     found = aimed.converged

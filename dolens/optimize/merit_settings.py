@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import field_shares
+from dolens.analysis.conditions import Conditions, conditions, field_shares
 from dolens.analysis.fields_and_wavelengths import that_count
 from dolens.analysis.pupil_quadrature import (
     SpotRays,
@@ -107,14 +107,17 @@ class MeritSettings:
         where = "merit.sampling_options"
         check_types(SAMPLINGS[self.sampling], _given(self.sampling_options), where)
 
-    def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
-        """Return (x, y) of every field that counts, degrees or mm.
+    def conditions_of(self, lens: Lens) -> Conditions:
+        """Return the fields and wavelengths that count, at the lens's own object distance.
 
         Raises:
-            InputError: neither the settings nor the lens name any, or one is not a pair, or weights
-                that do not fit.
+            InputError: neither the settings nor the lens name fields or wavelengths, a field is not
+                a pair, or weights do not fit.
         """
-        return self._fields(lens)[0]
+        fields, weights = self._fields(lens)
+        waves, shares = self._spectrum(lens)
+        found = conditions(lens, fields, waves, wavelength_weights=shares)
+        return replace(found, field_weights=weights / weights.sum())
 
     def _fields(self, lens: Lens) -> tuple[list[Sequence[float]], Tensor]:
         """Return the fields whose weight is not zero, and their weights (F,)."""
@@ -142,20 +145,8 @@ class MeritSettings:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
         return lens.fields.points
 
-    def wavelengths_of(self, lens: Lens) -> Sequence[float]:
-        """Return every wavelength that counts, nm.
-
-        Raises:
-            InputError: neither the settings nor the lens name any, or weights that do not fit.
-        """
-        return self.spectrum_of(lens)[0].tolist()
-
-    def spectrum_of(self, lens: Lens) -> tuple[Tensor, Tensor]:
-        """Return every wavelength that counts, nm, and their shares, which sum to one, both (W,).
-
-        Raises:
-            InputError: as `wavelengths_of`.
-        """
+    def _spectrum(self, lens: Lens) -> tuple[Tensor, Tensor]:
+        """Return the wavelengths that count, nm, and their shares, which sum to one, both (W,)."""
         wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
         if not wavelengths:
             raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
@@ -171,7 +162,8 @@ class MeritSettings:
         Raises:
             InputError: no fields or wavelengths, or an unknown sampling or option.
         """
-        fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
+        where = self.conditions_of(lens)
+        spots = where.fields.tolist(), where.wavelengths.tolist()
         options = _given(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
             options.setdefault("object_distance", lens.object_distance)
@@ -185,15 +177,14 @@ class MeritSettings:
                 f"'{lens.name}' has object_distance {lens.object_distance:g} mm"
             )
         sampling = SAMPLINGS[self.sampling]
-        where = "merit.sampling_options"
-        rays = call_with_settings(sampling, options, where, lens, fields, wavelengths)
+        rays = call_with_settings(sampling, options, "merit.sampling_options", lens, *spots)
         if self.reference == "chief":
             return with_chief_rays(lens, rays, lens.object_distance)
         return rays
 
     def weights(self, lens: Lens) -> Tensor:
         """Return the weight (S,) of every spot of `rays`; they sum to one."""
-        weights = torch.outer(self._fields(lens)[1], self.spectrum_of(lens)[1]).flatten()
+        weights = torch.outer(self._fields(lens)[1], self._spectrum(lens)[1]).flatten()
         return weights / weights.sum()
 
     def states_of(self, lens: Lens) -> dict[str, float]:

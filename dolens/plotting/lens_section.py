@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
+from dolens.analysis.conditions import Conditions
 from dolens.errors import InputError
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
@@ -30,40 +30,32 @@ from dolens.plotting.style import (
 
 @torch.no_grad()
 def lens_section_figure(
-    lens: Lens,
-    fields: Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    field_unit: str = "°",
-    object_distance: float | None = None,
-    rays: int = 7,
-    title: str | None = None,
+    lens: Lens, where: Conditions, rays: int = 7, title: str | None = None
 ) -> Figure:
     """Draw the section of a lens in the y-z plane with the rays of its fields in that plane.
 
     Args:
         lens: the lens.
-        fields: (F, 2), degrees or mm; those beside the y-z plane are left out.
-        wavelengths: nm; rays of the reference or nearest one are drawn.
-        field_unit: of the fields.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
+        where: fields, of which those beside the y-z plane are left out; wavelengths, of which rays
+            of the reference or nearest one are drawn; and object distance.
         rays: of each field.
         title: None for the lens, its aperture and the wavelength.
 
     Raises:
         InputError: see `layout_figure`.
     """
-    waves = torch.as_tensor(wavelengths, dtype=torch.float64)
-    wave = float(waves[int((waves - lens.primary_wavelength).abs().argmin())])
-    heights = list(dict.fromkeys(y for x, y in fields.tolist() if x == 0.0)) or [0.0]
-    angles = section_angles(lens, heights, wave, object_distance)
+    nearest = (where.wavelengths - where.reference_wavelength).abs().argmin()
+    wave = float(where.wavelengths[int(nearest)])
+    heights = list(dict.fromkeys(y for x, y in where.fields.tolist() if x == 0.0)) or [0.0]
+    angles = section_angles(lens, heights, wave, where.object_distance)
     if title is None:
-        title = caption("Section", lens, [wave], object_distance)
-    figure = layout_figure(lens, wave, angles, rays, object_distance, title)
+        title = caption("Section", lens, where.at(wavelengths=wave))
+    figure = layout_figure(lens, wave, angles, rays, where.object_distance, title)
     legend = figure.axes[0].get_legend()
     if legend is not None:
         for text, height in zip(legend.get_texts(), heights, strict=True):
             dark = " (no ray passes)" if "no ray" in text.get_text() else ""
-            text.set_text(field_label((0.0, height), field_unit) + dark)
+            text.set_text(field_label((0.0, height), where.field_unit) + dark)
     return figure
 
 

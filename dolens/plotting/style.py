@@ -22,6 +22,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from torch import Tensor
 
+from dolens.analysis.conditions import Conditions
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
@@ -348,12 +349,7 @@ _LONGEST_NAME, _LINE_OF_CAPTION = 50, 52
 
 
 @torch.no_grad()
-def caption(
-    what: str,
-    lens: Lens,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-) -> str:
+def caption(what: str, lens: Lens, where: Conditions) -> str:
     """Return a title such as `Spot diagram: Cooke triplet, F/4.93, 587.6 nm`; lines break where
     one is too long for a narrow figure.
 
@@ -361,16 +357,17 @@ def caption(
         what: the figure shows.
         lens: the lens; its F-number is the paraxial one of its stop at the reference wavelength, in
             the y-z section.
-        wavelengths: nm.
-        object_distance: mm; given, the working F-number and the distance are named.
+        where: wavelengths and object distance; of a near object the working F-number and the
+            distance are named.
     """
-    first = first_order(lens.system().section("y"), lens.primary_wavelength, object_distance)
+    object_distance = where.object_distance
+    first = first_order(lens.system().section("y"), where.reference_wavelength, object_distance)
     number = abs(float(first.working_f_number))
     parts = []
     if math.isfinite(number):
         working = "" if object_distance is None else "working "
         parts.append(f"{working}F/{number:.3g}")
-    parts.append(wavelengths_text(wavelengths))
+    parts.append(wavelengths_text(where.wavelengths))
     if object_distance is not None:
         parts.append(f"object at {object_distance:g} mm")
     name = [f"{plain_text(lens.name)},"] if lens.name else []

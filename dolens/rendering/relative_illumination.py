@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.analysis.ray_intercepts import uniform_pupil_points
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import pupil_rays, rim_rays
 from dolens.scene.scene import bilinear

@@ -15,7 +15,7 @@ from dolens.views.overview import as_lens, looked_at, shown, title_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from dolens.analysis.conditions import FieldPoints
+    from dolens.analysis.fields_and_wavelengths import FieldPoints
     from dolens.views.overview import Wavelengths
 
 KINDS = ("fourier", "huygens")
@@ -50,7 +50,7 @@ class ImageQualityViews:
         from dolens.plotting.spots_and_ray_fans import spots_figure
 
         lens, given = looked_at(self.spots, fields, wavelengths, object_distance, aperture)
-        spots = spot_diagram(lens, given.fields, given.wavelengths, rays, given.object_distance)
+        spots = spot_diagram(lens, given, rays)
         return shown(spots_figure(spots, overlaid, title_of("Spot diagram", lens, given)))
 
     def ray_fans(
@@ -65,10 +65,7 @@ class ImageQualityViews:
         from dolens.plotting.spots_and_ray_fans import ray_fans_figure
 
         lens, given = looked_at(self.ray_fans, fields, wavelengths, object_distance, aperture)
-        fans = ray_fans(
-            lens, given.fields, given.wavelengths, object_distance=given.object_distance
-        )
-        return shown(ray_fans_figure(fans, title_of("Ray fans", lens, given)))
+        return shown(ray_fans_figure(ray_fans(lens, given), title_of("Ray fans", lens, given)))
 
     def mtf(
         self,
@@ -104,13 +101,11 @@ class ImageQualityViews:
         from dolens.plotting.modulation import modulation_comparison_figure
 
         lens, given = looked_at(self.mtf, fields, wavelengths, object_distance, aperture)
-        scene = given.fields, given.wavelengths
-        distance = given.object_distance
         if frequencies is None:
-            frequencies = frequency_range(lens, *scene, distance)
+            frequencies = frequency_range(lens, given)
         by_waves = huygens_modulation if kind == "huygens" else diffraction_modulation
-        wave = by_waves(lens, *scene, frequencies, distance) if diffraction else None
-        rays = modulation(lens, *scene, frequencies, 6000, distance) if geometric else None
+        wave = by_waves(lens, given, frequencies) if diffraction else None
+        rays = modulation(lens, given, frequencies) if geometric else None
         title = title_of("Modulation transfer function", lens, given)
         return shown(modulation_comparison_figure(wave, rays, title))
 
@@ -141,9 +136,8 @@ class ImageQualityViews:
         lens, given = looked_at(
             self.encircled_energy, fields, wavelengths, object_distance, aperture
         )
-        scene, distance = (given.fields, given.wavelengths), given.object_distance
-        waves = diffraction_encircled_energy(lens, *scene, radii_um, distance)
-        rays = encircled_energy(lens, *scene, waves.radii_um, object_distance=distance)
+        waves = diffraction_encircled_energy(lens, given, radii_um)
+        rays = encircled_energy(lens, given, waves.radii_um)
         title = title_of("Encircled energy", lens, given)
         return shown(encircled_energy_figure(waves, rays, title))
 
@@ -175,7 +169,7 @@ class ImageQualityViews:
 
         lens, given = looked_at(self.psf, fields, wavelengths, object_distance, aperture)
         by_waves = huygens_point_spread if kind == "huygens" else point_spread
-        found = by_waves(lens, given.fields, given.wavelengths, given.object_distance)
+        found = by_waves(lens, given)
         return shown(point_spread_figure(found, title_of("Point spread functions", lens, given)))
 
     def wavefront(
@@ -200,7 +194,7 @@ class ImageQualityViews:
 
         waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
         lens, given = looked_at(self.wavefront, fields, waves, object_distance, aperture)
-        maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
+        maps = wavefront_maps(lens, given)
         return shown(wavefront_maps_figure(maps, title_of("Wavefront error", lens, given)))
 
     def zernike(
@@ -229,7 +223,7 @@ class ImageQualityViews:
 
         wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(self.zernike, fields, wavelength, object_distance, aperture)
-        maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
+        maps = wavefront_maps(lens, given)
         title = title_of("Zernike coefficients", lens, given)
         return shown(zernike_figure(maps, order, terms, title))
 
@@ -258,10 +252,9 @@ class ImageQualityViews:
         from dolens.plotting.field_curves import field_curves_figure
 
         lens, given = looked_at(self.field_curves, 0.0, wavelengths, object_distance, aperture)
-        distance = given.object_distance
         curves = [
-            field_curves(lens, scan, given.wavelengths, distance, distortion)
-            for scan in field_scans(lens, distance, edge)
+            field_curves(lens, scan, given.wavelengths, distortion)
+            for scan in field_scans(lens, given.object_distance, edge)
         ]
         return shown(field_curves_figure(curves, title_of("Field curves", lens, given)))
 
@@ -290,10 +283,7 @@ class ImageQualityViews:
         lines = spectral_lines(as_lens(self)) if wavelengths is None else wavelengths
         lens, given = looked_at(self.lateral_colour, 0.0, lines, object_distance, aperture)
         distance, waves = given.object_distance, given.wavelengths
-        colour = [
-            lateral_colour(lens, scan, waves, distance)
-            for scan in field_scans(lens, distance, edge)
-        ]
+        colour = [lateral_colour(lens, scan, waves) for scan in field_scans(lens, distance, edge)]
         low, high = float(waves.min()), float(waves.max())
         shift = (
             chromatic_focal_shift(lens, (low, high), object_distance=distance)
@@ -327,12 +317,9 @@ class ImageQualityViews:
         from dolens.plotting.field_curves import rms_curves_figure
 
         lens, given = looked_at(self.rms, fields, wavelengths, object_distance, aperture)
-        distance = given.object_distance
-        far = field_scans(lens, distance, edge)[0].fields[-1]
-        over_field = rms_against_field(lens, given.wavelengths, far, object_distance=distance)
-        over_wave = rms_against_wavelength(
-            lens, given.fields, wavelength_interval(lens), object_distance=distance
-        )
+        far = field_scans(lens, given.object_distance, edge)[0].fields[-1]
+        over_field = rms_against_field(lens, given, far)
+        over_wave = rms_against_wavelength(lens, given, wavelength_interval(lens))
         title = title_of("RMS spot radius", lens, given)
         return shown(rms_curves_figure(over_field, over_wave, title))
 
@@ -359,10 +346,9 @@ class ImageQualityViews:
         lens, given = looked_at(
             self.relative_illumination, 0.0, wavelength, object_distance, aperture
         )
-        distance = given.object_distance
         curves = [
-            relative_illumination(lens, scan, wavelength, distance)
-            for scan in field_scans(lens, distance, edge)
+            relative_illumination(lens, scan, wavelength)
+            for scan in field_scans(lens, given.object_distance, edge)
         ]
         title = title_of("Relative illumination", lens, given)
         return shown(illumination_figure(curves, title))
@@ -390,9 +376,8 @@ class ImageQualityViews:
 
         waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
         lens, given = looked_at(self.strehl, 0.0, waves, object_distance, aperture)
-        distance = given.object_distance
         scans = [
-            (scan, strehl_ratios(lens, scan, given.wavelengths, distance))
-            for scan in field_scans(lens, distance, edge, count)
+            (scan, strehl_ratios(lens, given.at(scan.fields)))
+            for scan in field_scans(lens, given.object_distance, edge, count)
         ]
         return shown(strehl_figure(scans, title_of("Strehl ratio", lens, given)))

@@ -11,7 +11,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from dolens.analysis.conditions import Conditions, FieldPoints
+    from dolens.analysis.conditions import Conditions
+    from dolens.analysis.fields_and_wavelengths import FieldPoints
     from dolens.analysis.ray_path import RayPath
     from dolens.analysis.summary import LensSummary
     from dolens.optics.lens import Lens
@@ -32,8 +33,7 @@ class OverviewViews:
         from dolens.analysis.summary import lens_summary
 
         lens, given = looked_at(self.summary, fields, wavelengths, object_distance, aperture)
-        distance = float("inf") if given.object_distance is None else given.object_distance
-        return lens_summary(lens, given.fields, given.wavelengths, distance)
+        return lens_summary(lens, given)
 
     def explain(self, rays: Rays) -> RayPath:
         """Follow one ray surface by surface, and say why it ends where it does.
@@ -64,16 +64,7 @@ class OverviewViews:
         from dolens.plotting.lens_section import lens_section_figure
 
         lens, given = looked_at(self.draw, fields, wavelengths, object_distance, aperture)
-        return shown(
-            lens_section_figure(
-                lens,
-                given.fields,
-                given.wavelengths,
-                given.field_unit,
-                given.object_distance,
-                rays,
-            )
-        )
+        return shown(lens_section_figure(lens, given, rays))
 
     def footprint(
         self,
@@ -97,7 +88,7 @@ class OverviewViews:
 
         wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(self.footprint, fields, wavelength, object_distance, aperture)
-        found = footprint(lens, given.fields, wavelength, rays, given.object_distance)
+        found = footprint(lens, given, wavelength, rays)
         return shown(footprint_figure(found, title_of("Footprints", lens, given)))
 
 
@@ -143,7 +134,7 @@ def title_of(what: str, lens: Lens, given: Conditions) -> str:
     """Return the title of a figure: what it shows, of which lens, and at which conditions."""
     from dolens.plotting.style import caption
 
-    return caption(what, lens, given.wavelengths, given.object_distance)
+    return caption(what, lens, given)
 
 
 def shown(figure: Figure) -> Figure:

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from dolens.analysis.conditions import field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.ray_intercepts import ray_fans
-from dolens.analysis.spot_diagram import working_f_numbers
 from dolens.experiments.design.merit_rays import (
     COMMON_CENTROID,
     merit_modulation,
@@ -75,9 +74,9 @@ def design_figures(
         merit_unit: of the merit function, for the history; empty where it has none.
         initial_merit: before the first iteration; NaN where it is not known.
     """
-    fields = [tuple(field) for field in settings.fields_of(lens)]
-    waves = list(settings.wavelengths_of(lens))
-    distance = lens.object_distance
+    where = settings.conditions_of(lens)
+    fields, waves = [tuple(field) for field in where.fields.tolist()], where.wavelengths.tolist()
+    distance = where.object_distance
 
     def spots() -> Figure:
         title = titled(lens, "final", _radius(lens, settings))
@@ -104,11 +103,7 @@ def design_figures(
     def transfer() -> Figure:
         most = max_frequency
         if most is None:
-            wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
-            number = float(working_f_numbers(lens, wave, distance)[0])
-            most = 0.5 / (1e-6 * lens.primary_wavelength * number)
-            blur = 1e-3 * spot_table(lens, settings).mean
-            most = min(most, _BLURRED / max(blur, 1e-12))
+            most = _contrast_end(lens, settings)
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
         found = {
             name: merit_modulation(of, settings, frequencies)
@@ -145,7 +140,7 @@ def design_figures(
         share = pupil_share(lens, settings)
         beyond = f"; shaded: beyond {pupil_text(settings)}" if share < 1.0 else ""
         return ray_fans_figure(
-            ray_fans(lens, fields, waves, _FAN_POINTS, distance),
+            ray_fans(lens, where, _FAN_POINTS),
             titled(lens, "final", f"ray fans across the whole stop{beyond}"),
             share,
         )
@@ -301,8 +296,8 @@ def _modulation(
 
 def _contrast_end(lens: Lens, settings: MeritSettings) -> float:
     """Return the frequency (cycles/mm) up to which a lens has contrast."""
-    wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
-    number = float(working_f_numbers(lens, wave, lens.object_distance)[0])
+    first = lens.first_order(lens.primary_wavelength, lens.object_distance)
+    number = abs(float(first.working_f_number))
     limit = 0.5 / (1e-6 * lens.primary_wavelength * number)
     return min(limit, _BLURRED / max(1e-3 * spot_table(lens, settings).mean, 1e-12))
 
@@ -310,11 +305,10 @@ def _contrast_end(lens: Lens, settings: MeritSettings) -> float:
 def _curves(there: Mapping[str, Lens], title: str) -> Figure:
     found = {}
     for name, lens in there.items():
-        distance = lens.object_distance
-        scan = field_scans(lens, distance)[0]
+        scan = field_scans(lens, lens.object_distance)[0]
         # A test runs without gradients, which the slopes of these curves are.
         with torch.inference_mode(False), torch.enable_grad():
-            found[name] = field_curves(lens, scan, [lens.primary_wavelength], distance)
+            found[name] = field_curves(lens, scan, [lens.primary_wavelength])
     wave = next(iter(there.values())).primary_wavelength
     what = f"field curvature and distortion at {wave:.4g} nm"
     return states_field_curves_figure(found, f"{title}\n{what}")
@@ -324,12 +318,10 @@ def field_names(there: Mapping[str, Lens], settings: MeritSettings) -> Sequence[
     """Return names of the fields that hold in all states: their places, where these are the same;
     else shares of the edge of each state's field.
     """
-    places = []
-    for lens in there.values():
-        unit = "°" if lens.object_distance is None else "mm"
-        places.append([field_label(point, unit) for point in settings.fields_of(lens)])
+    each = [settings.conditions_of(lens) for lens in there.values()]
+    places = [[field_label(p, where.field_unit) for p in where.fields.tolist()] for where in each]
     if all(found == places[0] for found in places):
         return places[0]
-    sizes = [math.hypot(*point) for point in settings.fields_of(next(iter(there.values())))]
+    sizes = [math.hypot(*point) for point in each[0].fields.tolist()]
     shares = [size / max(max(sizes), 1e-12) for size in sizes]
     return ["axis" if s < 1e-6 else "edge" if s > 0.999 else f"{s:.2f} of edge" for s in shares]

@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dolens.analysis.conditions import Conditions
 from dolens.analysis.modulation_transfer import (
     Modulation,
     diffraction_limited_transfer,
@@ -19,7 +20,6 @@ from dolens.analysis.modulation_transfer import (
     modulation,
     modulation_transfer,
 )
-from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.spot_diagram import (
     AIRY,
     RMSCurves,
@@ -48,44 +48,38 @@ _STEEP = 10.0
 @torch.no_grad()
 def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
     """Return the spots of a lens, with the RMS radii of `rms_spot_um` (mm)."""
-    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
-    waves = wavelengths.tolist()
+    where = settings.conditions_of(lens)
     quality, values, hits = _traced(lens, settings)
-    shape = (len(fields), len(waves))
+    shape = (len(where.fields), len(where.wavelengths))
     rms = values.rms.double().cpu().reshape(shape)
     if not is_grid(settings):
-        distance = lens.object_distance
-        found = spot_diagram(
-            lens, fields, waves, object_distance=distance, wavelength_weights=shares
-        )
-        return replace(found, rms=rms)
+        return replace(spot_diagram(lens, where), rms=rms)
     spot = quality.spots.spot.cpu()
     points = _padded(hits, spot, quality.spots.count).unflatten(0, shape)
     valid = points.isfinite().all(-1)
     light = valid.double()
     extent = values.deviations.double().cpu().norm(dim=1, keepdim=True)
     geo = _padded(extent, spot, quality.spots.count).nan_to_num(0.0).amax((1, 2))
-    every = light * shares[:, None]
+    every = light * where.weights[:, None]
     common, square = moments(points.flatten(1, 2), every.flatten(1, 2))
-    chief = lens.chief_ray(
-        torch.tensor(list(fields), dtype=lens.dtype, device=lens.device), lens.primary_wavelength
-    )
+    places = where.fields.to(dtype=lens.dtype, device=lens.device)
+    chief = lens.chief_ray(places, where.reference_wavelength)
     return SpotDiagram(
-        fields=torch.tensor(list(fields), dtype=torch.float64),
-        field_unit=field_unit(lens.object_distance),
-        wavelengths=wavelengths,
-        reference_wavelength=lens.primary_wavelength,
+        fields=where.fields,
+        field_unit=where.field_unit,
+        wavelengths=where.wavelengths,
+        reference_wavelength=where.reference_wavelength,
         intercepts=points,
         valid=valid,
         weight=torch.full((points.shape[2],), 1.0 / points.shape[2], dtype=torch.float64),
-        wavelength_weight=shares,
+        wavelength_weight=where.weights,
         chief=lens.trace(chief).position[..., :2].double().cpu(),
         centroid=moments(points, light)[0],
         rms=rms,
         geo=geo.reshape(shape),
         polychromatic_centroid=common,
         polychromatic_rms=square.sqrt(),
-        airy_radius=AIRY * wavelengths * 1e-6 * pupil_f_numbers(lens, settings, wavelengths),
+        airy_radius=_airy_radii(lens, settings, where),
     )
 
 
@@ -103,30 +97,23 @@ def merit_modulation(
     Returns:
         The MTF, and labels of the fields that are such products.
     """
-    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
-    distance = lens.object_distance
+    where = settings.conditions_of(lens)
+    wavelengths, shares = where.wavelengths, where.weights
     if pupil_share(lens, settings) < 1.0:
         found = _grid_modulation(lens, settings, frequencies)
         return found, [field_label(field, found.field_unit) for field in found.fields]
-    numbers = working_f_numbers(lens, wavelengths, distance)
+    numbers = working_f_numbers(lens, where)
     limit = shares @ diffraction_limited_transfer(
         frequencies, wavelengths[:, None], numbers[:, None]
     )
     airy = float(AIRY * 1e-3 * shares @ (wavelengths * numbers))
     if spot_table(lens, settings).mean > _STEEP * airy:
         # Diffraction changes next to nothing, and a wave calculation takes long.
-        rays = modulation(
-            lens,
-            fields,
-            wavelengths,
-            frequencies,
-            object_distance=distance,
-            wavelength_weights=shares,
-        )
+        rays = modulation(lens, where, frequencies)
         products = {"tangential": rays.tangential * limit, "sagittal": rays.sagittal * limit}
         labels = [field_label(field, rays.field_unit) for field in rays.fields]
         return replace(rays, **products, diffraction_limit=limit), labels
-    whole = diffraction_modulation(lens, fields, wavelengths, frequencies, distance, shares)
+    whole = diffraction_modulation(lens, where, frequencies)
     by_rays = [not done for done in whole.diffraction]
     factor = torch.where(torch.tensor(by_rays)[:, None], limit, 1.0)
     found = Modulation(
@@ -147,15 +134,14 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
 
     The grid is denser than that of `rms_spot_um`, and as large.
     """
-    fields, (wavelengths, shares) = settings.fields_of(lens), settings.spectrum_of(lens)
+    where = settings.conditions_of(lens)
     dense = {**settings.sampling_options, "count": _DENSE_GRID}
     quality, _, hits = _traced(lens, replace(settings, sampling_options=dense))
     points = _padded(hits, quality.spots.spot.cpu(), quality.spots.count)
-    points = points.unflatten(0, (len(fields), len(wavelengths)))
-    light = (points.isfinite().all(-1) * shares[:, None]).flatten(1, 2)
+    points = points.unflatten(0, (len(where.fields), len(where.wavelengths)))
+    light = (points.isfinite().all(-1) * where.weights[:, None]).flatten(1, 2)
     points = points.flatten(1, 2).nan_to_num(0.0)
-    field = torch.tensor([tuple(one) for one in fields], dtype=torch.float64)
-    along = field_directions(field, lens.object_distance)
+    along = field_directions(where)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
     tangential, sagittal = (
         torch.stack(
@@ -166,11 +152,16 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
         )
         for way in (along, across)
     )
-    numbers = pupil_f_numbers(lens, settings, wavelengths)
-    limit = shares @ _square_limits(numbers, wavelengths, frequencies)
-    unit = field_unit(lens.object_distance)
+    numbers = pupil_f_numbers(lens, settings, where)
+    limit = where.weights @ _square_limits(numbers, where.wavelengths, frequencies)
     return Modulation(
-        field, unit, wavelengths, frequencies, tangential * limit, sagittal * limit, limit
+        where.fields,
+        where.field_unit,
+        where.wavelengths,
+        frequencies,
+        tangential * limit,
+        sagittal * limit,
+        limit,
     )
 
 
@@ -190,7 +181,7 @@ def merit_rms_against_field(
     """
     steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64).tolist()
     fields = [tuple(a + s * (b - a) for a, b in zip(start, edge, strict=True)) for s in steps]
-    return _curves(lens, settings, fields, *settings.spectrum_of(lens))
+    return _curves(lens, settings, settings.conditions_of(lens).at(fields))
 
 
 def merit_rms_against_wavelength(
@@ -199,32 +190,31 @@ def merit_rms_against_wavelength(
     """Return RMS radii over wavelengths, each about its own centroid or chief ray."""
     waves = torch.linspace(*interval, _CURVE_POINTS, dtype=torch.float64)
     own = replace(settings, reference_spectrum="monochromatic")
-    alike = torch.full_like(waves, 1.0 / len(waves))
-    return _curves(lens, own, settings.fields_of(lens), waves, alike)
+    return _curves(lens, own, settings.conditions_of(lens).at(wavelengths=waves))
 
 
 @torch.no_grad()
-def _curves(
-    lens: Lens,
-    settings: MeritSettings,
-    fields: Sequence[Sequence[float]],
-    wavelengths: Tensor,
-    shares: Tensor,
-) -> RMSCurves:
-    own = replace(settings, wavelengths=wavelengths.tolist(), wavelength_weights=shares.tolist())
+def _curves(lens: Lens, settings: MeritSettings, where: Conditions) -> RMSCurves:
+    fields, waves = where.fields.tolist(), where.wavelengths.tolist()
+    own = replace(settings, wavelengths=waves, wavelength_weights=where.weights.tolist())
     try:
         rms, together = _radii(lens, own, fields)
     except InputError:  # no light of some field passes
         rows = [_radii_or_none(lens, own, field) for field in fields]
         rms, together = (torch.cat(part) for part in zip(*rows, strict=True))
     return RMSCurves(
-        fields=torch.tensor([tuple(field) for field in fields], dtype=torch.float64),
-        field_unit=field_unit(lens.object_distance),
-        wavelengths=wavelengths,
+        fields=where.fields,
+        field_unit=where.field_unit,
+        wavelengths=where.wavelengths,
         rms=rms,
         polychromatic=together,
-        airy_radius=AIRY * wavelengths * 1e-6 * pupil_f_numbers(lens, settings, wavelengths),
+        airy_radius=_airy_radii(lens, settings, where),
     )
+
+
+def _airy_radii(lens: Lens, settings: MeritSettings, where: Conditions) -> Tensor:
+    """Return 1.22·λ·N (W,), mm, of the pupil that the rays fill."""
+    return AIRY * where.wavelengths * 1e-6 * pupil_f_numbers(lens, settings, where)
 
 
 def _radii(
@@ -234,7 +224,7 @@ def _radii(
     alike = [1.0] * len(fields)
     settings = replace(settings, fields=[tuple(field) for field in fields], field_weights=alike)
     quality = settings.image_quality(lens)
-    _, shares = settings.spectrum_of(lens)
+    shares = settings.conditions_of(lens).weights
     shape = (len(fields), len(shares))
     rms = quality.values(lens).rms.double().cpu().reshape(shape)
     common = replace(quality, reference_spectrum="polychromatic").values(lens)
@@ -248,7 +238,8 @@ def _radii_or_none(
     try:
         return _radii(lens, settings, [field])
     except InputError:
-        dark = torch.full((1, len(settings.wavelengths_of(lens))), math.nan, dtype=torch.float64)
+        count = len(settings.conditions_of(lens).wavelengths)
+        dark = torch.full((1, count), math.nan, dtype=torch.float64)
         return dark, dark[:, 0]
 
 
@@ -328,7 +319,6 @@ def whole_stop_rms(lens: Lens, settings: MeritSettings) -> float | None:
     return spot_table(lens, replace(settings, **whole)).mean
 
 
-def pupil_f_numbers(lens: Lens, settings: MeritSettings, wavelengths: Tensor) -> Tensor:
+def pupil_f_numbers(lens: Lens, settings: MeritSettings, where: Conditions) -> Tensor:
     """Return working F-numbers of the pupil that the rays fill."""
-    whole = working_f_numbers(lens, wavelengths, lens.object_distance)
-    return whole / pupil_share(lens, settings)
+    return working_f_numbers(lens, where) / pupil_share(lens, settings)

@@ -200,7 +200,7 @@ def fit_edges(lens: Lens, initial: Lens | None, settings: MeritSettings) -> None
             rays = settings.rays(initial.in_state(state))
             edges[state] = fitted_semi_diameters(there, rays)
             continue
-        own = rim_rays(there, settings.fields_of(there), settings.wavelengths_of(there))
+        own = rim_rays(there, settings.conditions_of(there))
         edges[state] = fitted_semi_diameters(there, own, _BESIDE)
         edges[state].pop(str(lens.stop), None)
     set_edges(lens, edges)

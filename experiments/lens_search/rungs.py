@@ -230,7 +230,7 @@ def _form(file: Path) -> SearchedForm:
     largest = math.tan(math.radians(float(own.fields.norm(dim=1).max())))
     zones = [(0.0, math.degrees(math.atan(share * largest))) for share in _ZONES]
     spots, by_area = (
-        _MM * float(shares @ spot_diagram(lens, fields, own.wavelengths).polychromatic_rms)
+        _MM * float(shares @ spot_diagram(lens, own.at(fields)).polychromatic_rms)
         for fields, shares in (
             (own.fields, own.field_weights),
             (zones, own.field_weights.new_full((len(zones),), 1.0 / len(zones))),

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.experiments.experiment import Analysis, Figures
@@ -130,7 +131,8 @@ class LensSearchModule(Analysis):
     def _numbers_of_best(self) -> dict[str, float]:
         best = self._best.found
         fields = [(0.0, float(angle)) for angle in self.specification.fields]
-        spots = spot_diagram(best.lens, fields, self.specification.wavelengths)
+        where = conditions(best.lens, fields, self.specification.wavelengths)
+        spots = spot_diagram(best.lens, where)
         colour = self._best.colour
         of_colour = (
             {}

@@ -13,7 +13,7 @@ import torch
 
 from dolens import InputError
 from dolens.alignment.pose import Pose
-from dolens.analysis.conditions import field_scans
+from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.analysis.ray_intercepts import ray_fans
@@ -65,7 +65,7 @@ def off_the_chief_ray(heights):
 
 def test_a_fan_lands_where_trigonometry_says_at_every_field(lens):
     """A flat stop is seen foreshortened in the y-z plane, and in full across it."""
-    fans = ray_fans(lens, FIELDS[:3], [WAVE], 9)
+    fans = ray_fans(lens, conditions(lens, FIELDS[:3], [WAVE]), 9)
     heights = STOP * fans.coordinate
     across = 1e3 * off_the_chief_ray(heights)
     assert across.abs().max() > 2.0
@@ -117,7 +117,7 @@ def test_a_wavefront_is_the_same_function_of_the_beam_at_every_field(lens):
 
 def test_spots_are_measured_along_the_surface(lens):
     """RMS of the spot against the closed form's own mean over the foreshortened beam."""
-    spots = spot_diagram(lens, FIELDS, [WAVE], 20000)
+    spots = spot_diagram(lens, conditions(lens, FIELDS, [WAVE]), 20000)
     unit = torch.linspace(-1.0, 1.0, 801, dtype=torch.float64)
     x, y = torch.meshgrid(unit, unit, indexing="ij")
     inside = x * x + y * y < 1.0
@@ -128,7 +128,7 @@ def test_spots_are_measured_along_the_surface(lens):
 
 
 def test_wavefronts_of_fields_are_about_where_the_light_lands(lens):
-    found = field_wavefronts(lens, FIELDS, [WAVE])
+    found = field_wavefronts(lens, conditions(lens, FIELDS, [WAVE]))
     expected = torch.stack((0.0 * ANGLES, RADIUS * torch.sin(ANGLES)), -1)
     assert (found.centre - expected).abs().max() < 1e-6
 

@@ -96,7 +96,7 @@ def test_a_plate_distorts_and_disperses_by_snell_s_law():
 def test_the_image_of_a_near_object_is_compared_with_its_magnification():
     """A stop alone is a pinhole: it images without distortion, upside down."""
     lens = plate_behind_a_stop("air")
-    found = field_curves(lens, scan(lens, 50.0, distance=100.0), LINES[:1], 100.0)
+    found = field_curves(lens, scan(lens, 50.0, distance=100.0), LINES[:1])
     assert found.scan.field_unit == "mm"
     np.testing.assert_allclose(found.distortion, 0.0, atol=1e-9)
 

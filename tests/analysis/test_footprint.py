@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import load_lens
-from dolens.analysis.conditions import field_scans
+from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.footprint import footprint
 from dolens.errors import InputError
@@ -17,7 +17,7 @@ from tests.diffraction.perfect_lenses import pinhole
 def test_a_parallel_beam_keeps_its_size_and_moves_by_the_tangent():
     """Behind a hole of radius 2 the field of 10° meets a plane 20 mm on at 20·tan 10°."""
     lens = pinhole(2.0, second=(20.0, 50.0))
-    found = footprint(lens, [(0.0, 0.0), (0.0, 10.0)], 500.0, 400)
+    found = footprint(lens, conditions(lens, [(0.0, 0.0), (0.0, 10.0)]), 500.0, 400)
     assert found.surfaces == (1, 2)
     shift = 20.0 * math.tan(math.radians(10.0))
     assert found.points[1, 1].mean(0).tolist() == pytest.approx([0.0, shift], abs=2e-3)
@@ -30,7 +30,13 @@ def test_a_parallel_beam_keeps_its_size_and_moves_by_the_tangent():
 def test_an_aperture_stops_its_share_of_the_light():
     """A second hole of the same radius a, shifted by d: two circles overlap by a known area."""
     a, gap, angle = 2.0, 10.0, 8.0
-    found = footprint(pinhole(a, second=(gap, a)), [(0.0, angle)], 500.0, 4000)
+    lens = pinhole(a, second=(gap, a))
+    found = footprint(
+        lens,
+        conditions(lens, [(0.0, angle)]),
+        500.0,
+        4000,
+    )
     d = gap * math.tan(math.radians(angle))
     overlap = 2.0 * math.acos(d / (2 * a)) - d / (2 * a * a) * math.sqrt(4 * a * a - d * d)
     assert float(found.clipped[1, 0]) == pytest.approx(1.0 - overlap / math.pi, abs=2e-3)
@@ -43,7 +49,7 @@ def test_an_aperture_stops_its_share_of_the_light():
 
 def test_an_obscuration_ends_the_middle_of_the_beam():
     lens = pinhole(2.0, second=(10.0, ClearAperture(Circle(9.0), Circle(1.0))))
-    found = footprint(lens, [(0.0, 0.0)], 500.0, 4000)
+    found = footprint(lens, conditions(lens, [(0.0, 0.0)]), 500.0, 4000)
     assert float(found.clipped[1, 0]) == pytest.approx(0.25, abs=2e-3)
     assert float(found.points[1, 0][found.passes[0]].norm(dim=-1).min()) >= 1.0
 
@@ -51,7 +57,7 @@ def test_an_obscuration_ends_the_middle_of_the_beam():
 def test_a_folded_beam_is_seen_in_the_mirror_s_own_axes(root):
     """The Newtonian's flat at 45° is met over √2 the height: an ellipse, in the mirror's plane."""
     lens = load_lens(root / "conf/lens/published/newtonian_200_f5.yaml").requires_grad_(False)
-    found = footprint(lens, [(0.0, 0.0)], rays=1000)
+    found = footprint(lens, conditions(lens, [(0.0, 0.0)]), rays=1000)
     assert found.surfaces == (1, 2, 3, 5)
     x, y = found.points[3, 0][found.passes[0]].unbind(-1)
     # The cone is 200·200/1000 mm wide there, and slopes.
@@ -62,7 +68,7 @@ def test_a_folded_beam_is_seen_in_the_mirror_s_own_axes(root):
 def test_a_fisheye_s_edge_of_the_field_gets_through(root):
     """Its surfaces have the sizes that 85° needs, though the paraxial pupil's rays miss them."""
     lens = load_lens(root / "conf/lens/published/fisheye_laikin_p114.yaml").requires_grad_(False)
-    found = footprint(lens, [(0.0, 85.0)], rays=40)
+    found = footprint(lens, conditions(lens, [(0.0, 85.0)]), rays=40)
     assert float(found.passes.double().mean()) > 0.9
     sizes = torch.tensor([surface.semi_diameter for surface in lens.surfaces.values()])
     # The stop's is its own.
@@ -77,7 +83,7 @@ def test_a_scan_lens_is_without_distortion_from_f_theta(root):
     """
     lens = load_lens(root / "conf/lens/published/ftheta_laikin_p251.yaml").requires_grad_(False)
     (scan,) = field_scans(lens, None, 15.0, 11)
-    theta = field_curves(lens, scan, [632.8], None, "f_theta").distortion
+    theta = field_curves(lens, scan, [632.8], "f_theta").distortion
     tangent = field_curves(lens, scan, [632.8]).distortion
     optiland = (0.002651, 0.010355, 0.022345, 0.037280, 0.053146)
     optiland += (0.067097, 0.075222, 0.072205, 0.050823, 0.001209)
@@ -92,11 +98,11 @@ def test_f_theta_is_that_of_fields_in_degrees():
     lens = pinhole(1.0)
     (scan,) = field_scans(lens, None, 30.0, 3)
     # A pinhole images by the tangent.
-    found = field_curves(lens, scan, [500.0], None, "f_theta").distortion
+    found = field_curves(lens, scan, [500.0], "f_theta").distortion
     angle = math.radians(30.0)
     assert float(found[-1]) == pytest.approx(100.0 * (math.tan(angle) / angle - 1.0))
     (near,) = field_scans(lens, 100.0, 5.0, 3)
     with pytest.raises(InputError, match="object at infinity"):
-        field_curves(lens, near, [500.0], 100.0, "f_theta")
+        field_curves(lens, near, [500.0], "f_theta")
     with pytest.raises(InputError, match="f_tan_theta, f_theta, not 'fisheye'"):
-        field_curves(lens, scan, [500.0], None, "fisheye")
+        field_curves(lens, scan, [500.0], "fisheye")

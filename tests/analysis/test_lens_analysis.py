@@ -9,9 +9,10 @@ import torch
 from scipy.special import j1
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.analysis.modulation_transfer import modulation
-from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.analysis.ray_intercepts import ray_fans, trace_ray_intercepts, uniform_pupil_points
+from dolens.analysis.pupil_quadrature import gaussian_quadrature, uniform_pupil_points
+from dolens.analysis.ray_intercepts import ray_fans, trace_ray_intercepts
 from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength, spot_diagram
 from dolens.errors import InputError
 from dolens.optics.paraxial import chief_ray_magnification
@@ -72,7 +73,7 @@ def test_pupil_points_fill_the_disc_uniformly():
 
 def test_defocus_alone_makes_a_disc(defocused):
     """The disc's radius is δ·tan u'; its RMS is that over √2, but for the change of u' with ρ."""
-    spots = spot_diagram(defocused, [(0.0, 0.0)], LINES[:2], rays=400)
+    spots = spot_diagram(defocused, conditions(defocused, [(0.0, 0.0)], LINES[:2]), rays=400)
     edge = DEFOCUS * hyperbola_slopes(RADIUS)
     assert spots.geo.tolist() == [pytest.approx([edge] * 2, rel=3e-4)]
     height = RADIUS * np.sqrt((np.arange(1000) + 0.5) / 1000)
@@ -83,13 +84,13 @@ def test_defocus_alone_makes_a_disc(defocused):
 
 
 def test_airy_radius_is_that_of_the_f_number(defocused):
-    spots = spot_diagram(defocused, [(0.0, 0.0)], LINES, rays=4)
+    spots = spot_diagram(defocused, conditions(defocused, [(0.0, 0.0)], LINES), rays=4)
     expected = [1.22 * line * 1e-6 * FOCAL / (2.0 * RADIUS) for line in LINES]
     assert spots.airy_radius.tolist() == pytest.approx(expected, rel=5e-4)
 
 
 def test_defocus_makes_straight_fans(defocused):
-    fans = ray_fans(defocused, [(0.0, 0.0)], LINES[1:2], count=9)
+    fans = ray_fans(defocused, conditions(defocused, [(0.0, 0.0)], LINES[1:2]), count=9)
     # Behind the focus, rays from above land below: -δ·tan u', nearly -δ·a/f·p.
     expected = -1e3 * DEFOCUS * hyperbola_slopes(RADIUS * fans.coordinate.numpy())
     for fan in (fans.tangential_um, fans.sagittal_um):
@@ -101,7 +102,7 @@ def test_defocus_makes_straight_fans(defocused):
 def test_modulation_of_defocus_is_that_of_a_disc(defocused):
     """Goodman: 2·J₁(x)/x with x = 2πν·(radius of the disc)."""
     frequency = torch.linspace(1.0, 60.0, 20)
-    mtf = modulation(defocused, [(0.0, 0.0)], LINES[1:2], frequency)
+    mtf = modulation(defocused, conditions(defocused, [(0.0, 0.0)], LINES[1:2]), frequency)
     x = 2.0 * math.pi * frequency.numpy() * DEFOCUS * RADIUS / FOCAL
     for curve in (mtf.tangential, mtf.sagittal):
         np.testing.assert_allclose(curve[0], np.abs(2.0 * j1(x) / x), atol=5e-3)
@@ -112,8 +113,9 @@ def test_fitted_rays_land_where_aimed_ones_do(root, name):
     lens = load_lens(root / f"conf/lens/{name}.yaml").requires_grad_(False)
     edge = lens.fields.points[-1] if lens.fields else (0.0, 10.0)
     pupil = uniform_pupil_points(40)[0][:40]
-    fitted = trace_ray_intercepts(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil)
-    aimed = trace_ray_intercepts(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil, exact=True)
+    where = conditions(lens, [edge, (3.0, 0.0)], LINES[1:2])
+    fitted = trace_ray_intercepts(lens, where, pupil)
+    aimed = trace_ray_intercepts(lens, where, pupil, exact=True)
     valid = aimed.valid & fitted.valid
     assert (aimed.valid == fitted.valid).double().mean() > 0.95 and valid.sum() > 10
     spread = (aimed.points - aimed.chief[:, None, None])[valid].norm(dim=-1).max()
@@ -131,7 +133,7 @@ def test_a_fitted_ray_is_exactly_one_of_its_object_point():
         }
     )
     pupil, _ = uniform_pupil_points(8)
-    found = trace_ray_intercepts(window, [(1.0, -3.0)], LINES[:1], pupil, object_distance=50.0)
+    found = trace_ray_intercepts(window, conditions(window, [(1.0, -3.0)], LINES[:1], 50.0), pupil)
     point = torch.tensor([1.0, -3.0]).double()
     # From (x, y, -50) through 5p in z = 0 to z = 20.
     expected = point + (5.0 * pupil - point) * 70.0 / 50.0
@@ -143,7 +145,7 @@ def test_spots_of_the_triplet_are_those_of_gauss_s_quadrature(root):
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     lens.reference_wavelength = LINES[2]
     fields = [(0.0, 0.0), (0.0, 10.0), (0.0, 20.0)]
-    spots = spot_diagram(lens, fields, LINES[2:], rays=6000)
+    spots = spot_diagram(lens, conditions(lens, fields, LINES[2:]), rays=6000)
     rays = gaussian_quadrature(lens, fields, LINES[2:], rings=6, arms=24)
     expected = RayInterceptResiduals(rays, torch.ones(rays.count)).values(lens).rms
     assert float(spots.rms[0]) == pytest.approx(float(expected[0]), rel=1e-4)
@@ -155,7 +157,9 @@ def test_spots_of_the_triplet_are_near_those_of_the_reference_grid(triplet, refe
     """Its 31×31 rays fill the entrance pupil, and some 193 of them pass."""
     entries = reference("rms_triplet__dfc.json")["entries"]
     fields = [(0.0, angle) for angle in (0.0, 10.0, 20.0)]
-    rms = dict(zip(fields, spot_diagram(triplet, fields, LINES).rms, strict=True))
+    rms = dict(
+        zip(fields, spot_diagram(triplet, conditions(triplet, fields, LINES)).rms, strict=True)
+    )
     assert len(entries) == 9
     for entry in entries:
         found = rms[0.0, float(entry["view_deg"])][LINES.index(float(entry["wavelength"]))]
@@ -163,7 +167,7 @@ def test_spots_of_the_triplet_are_near_those_of_the_reference_grid(triplet, refe
 
 
 def test_a_finite_object_is_imaged_at_its_magnification(triplet):
-    spots = spot_diagram(triplet, [(0.0, 0.1)], LINES[1:2], rays=100, object_distance=800.0)
+    spots = spot_diagram(triplet, conditions(triplet, [(0.0, 0.1)], LINES[1:2], 800.0), rays=100)
     expected = 0.1 * float(chief_ray_magnification(triplet.system(), LINES[1], 800.0))
     assert float(spots.chief[0, 1]) == pytest.approx(expected, rel=1e-3)
     assert spots.field_unit == "mm"
@@ -171,14 +175,14 @@ def test_a_finite_object_is_imaged_at_its_magnification(triplet):
 
 def test_a_lens_in_single_precision_is_analysed_in_double(root, triplet):
     single = load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float32)
-    spots = spot_diagram(single, [(0.0, 14.0)], LINES[:1], rays=200)
+    spots = spot_diagram(single, conditions(single, [(0.0, 14.0)], LINES[:1]), rays=200)
     assert spots.intercepts.dtype == torch.float64 and single.dtype == torch.float32
-    expected = spot_diagram(triplet, [(0.0, 14.0)], LINES[:1], rays=200).rms
+    expected = spot_diagram(triplet, conditions(triplet, [(0.0, 14.0)], LINES[:1]), rays=200).rms
     assert torch.allclose(spots.rms, expected, rtol=1e-3)
 
 
 def test_fans_of_a_meridional_field_are_symmetric_about_its_plane(triplet):
-    fans = ray_fans(triplet, [(0.0, 0.0), (0.0, 14.0)], LINES, count=21)
+    fans = ray_fans(triplet, conditions(triplet, [(0.0, 0.0), (0.0, 14.0)], LINES), count=21)
     assert torch.allclose(fans.sagittal_um, -fans.sagittal_um.flip(-1), atol=1e-8)
     # On the axis both are the same.
     assert torch.allclose(fans.sagittal_um[0], fans.tangential_um[0], atol=1e-8)
@@ -189,7 +193,7 @@ def test_fans_of_a_meridional_field_are_symmetric_about_its_plane(triplet):
 
 def test_fans_cross_at_the_lateral_colour(triplet):
     field = (0.0, 20.0)
-    fans = ray_fans(triplet, [field], LINES, count=3)
+    fans = ray_fans(triplet, conditions(triplet, [field], LINES), count=3)
     height = {w: float(triplet.trace(triplet.chief_ray(field, w)).position[1]) for w in LINES}
     for number, line in enumerate(LINES):
         expected = 1e3 * (height[line] - height[587.5618])
@@ -199,7 +203,7 @@ def test_fans_cross_at_the_lateral_colour(triplet):
 def test_modulation_turns_with_the_field(triplet):
     frequency = [0.0, 10.0, 25.0, 50.0]
     fields = [(0.0, 14.0), (14.0, 0.0)]
-    mtf = modulation(triplet, fields, LINES, frequency)
+    mtf = modulation(triplet, conditions(triplet, fields, LINES), frequency)
     for curves in (mtf.tangential, mtf.sagittal):
         assert torch.allclose(curves[0], curves[1], atol=5e-3)
         assert curves[:, 0].tolist() == pytest.approx([1.0, 1.0])
@@ -208,48 +212,59 @@ def test_modulation_turns_with_the_field(triplet):
 
 def test_weights_choose_among_wavelengths(triplet):
     field, frequency = [(0.0, 14.0)], [20.0]
-    alone = modulation(triplet, field, LINES[:1], frequency)
-    chosen = modulation(triplet, field, LINES, frequency, wavelength_weights=(2.0, 0.0, 0.0))
+    alone = modulation(triplet, conditions(triplet, field, LINES[:1]), frequency)
+    chosen = modulation(
+        triplet, conditions(triplet, field, LINES, wavelength_weights=(2.0, 0.0, 0.0)), frequency
+    )
     assert chosen.tangential.tolist() == [pytest.approx(alone.tangential[0].tolist())]
     assert chosen.diffraction_limit.tolist() == pytest.approx(alone.diffraction_limit.tolist())
-    spots = spot_diagram(triplet, field, LINES, rays=200, wavelength_weights=(0.0, 0.0, 1.0))
+    spots = spot_diagram(
+        triplet, conditions(triplet, field, LINES, wavelength_weights=(0.0, 0.0, 1.0)), rays=200
+    )
     assert float(spots.polychromatic_rms) == pytest.approx(float(spots.rms[0, 2]))
     for wrong in ((1.0, 1.0), (1.0, -1.0, 1.0), (0.0, 0.0, 0.0)):
         with pytest.raises(InputError, match="wavelength_weights"):
-            spot_diagram(triplet, field, LINES, wavelength_weights=wrong)
+            spot_diagram(triplet, conditions(triplet, field, LINES, wavelength_weights=wrong))
 
 
 def test_curves_are_the_spots_of_their_fields_and_wavelengths(triplet):
-    curves = rms_against_field(triplet, LINES, (0.0, 20.0), count=3, rays=400)
+    curves = rms_against_field(
+        triplet, conditions(triplet, wavelengths=LINES), (0.0, 20.0), count=3, rays=400
+    )
     assert curves.fields.tolist() == [[0.0, 0.0], [0.0, 10.0], [0.0, 20.0]]
-    spots = spot_diagram(triplet, [(0.0, 10.0)], LINES, rays=400)
+    spots = spot_diagram(triplet, conditions(triplet, [(0.0, 10.0)], LINES), rays=400)
     assert torch.allclose(curves.rms[1], spots.rms[0])
     assert torch.allclose(curves.polychromatic[1], spots.polychromatic_rms[0])
-    curves = rms_against_wavelength(triplet, [(0.0, 10.0)], (486.1327, 656.2725), 2, rays=400)
+    curves = rms_against_wavelength(
+        triplet, conditions(triplet, [(0.0, 10.0)]), (486.1327, 656.2725), 2, rays=400
+    )
     assert torch.allclose(curves.rms[0], spots.rms[0, [2, 0]])
 
 
 def test_fields_that_do_not_pass_are_nan(triplet):
     """Beyond some 31° the triplet's apertures overlap no more."""
-    curves = rms_against_field(triplet, LINES[:1], (0.0, 45.0), count=4, rays=100)
+    curves = rms_against_field(
+        triplet, conditions(triplet, wavelengths=LINES[:1]), (0.0, 45.0), count=4, rays=100
+    )
     assert torch.isnan(curves.rms[:, 0]).tolist() == [False, False, False, True]
     assert torch.isnan(curves.polychromatic).tolist() == [False, False, False, True]
-    mtf = modulation(triplet, [(0.0, 35.0)], LINES[:1], [0.0, 1.0])
+    mtf = modulation(triplet, conditions(triplet, [(0.0, 35.0)], LINES[:1]), [0.0, 1.0])
     assert torch.isnan(mtf.tangential).all() and not torch.isnan(mtf.diffraction_limit).any()
 
 
 def test_the_lens_s_own_field_and_spectrum_are_the_defaults(root, triplet):
     lens = load_lens(root / "conf/lens/double_gauss.yaml")
-    curves = rms_against_field(lens, LINES[:1], count=2, rays=8)
+    curves = rms_against_field(lens, conditions(lens, wavelengths=LINES[:1]), count=2, rays=8)
     assert curves.fields[-1].tolist() == [0.0, 22.0]
-    curves = rms_against_wavelength(lens, [(0.0, 0.0)], count=3, rays=8)
+    curves = rms_against_wavelength(lens, conditions(lens, [(0.0, 0.0)]), count=3, rays=8)
     assert curves.wavelengths[[0, -1]].tolist() == [486.1327, 656.2725]
     bare = copy.copy(triplet)
     bare.fields = bare.wavelengths = None
-    with pytest.raises(InputError, match="edge"):
-        rms_against_field(bare, LINES)
+    where = conditions(bare, wavelengths=LINES[:1])
+    curves = rms_against_field(bare, where, count=2, rays=8)
+    assert curves.fields[-1].tolist() == where.fields[-1].tolist()
     with pytest.raises(InputError, match="interval"):
-        rms_against_wavelength(bare, [(0.0, 0.0)])
+        rms_against_wavelength(bare, conditions(bare, [(0.0, 0.0)]))
 
 
 @pytest.mark.parametrize(
@@ -257,9 +272,11 @@ def test_the_lens_s_own_field_and_spectrum_are_the_defaults(root, triplet):
 )
 def test_what_is_no_field_or_wavelength_is_refused(triplet, fields, lines):
     with pytest.raises(InputError, match="at least one"):
-        spot_diagram(triplet, fields, lines)
+        conditions(triplet, fields, lines)
 
 
 def test_parameters_keep_no_graph(root):
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml")
-    assert not spot_diagram(lens, [(0.0, 0.0)], LINES[:1], rays=8).rms.requires_grad
+    assert not spot_diagram(
+        lens, conditions(lens, [(0.0, 0.0)], LINES[:1]), rays=8
+    ).rms.requires_grad

@@ -10,7 +10,7 @@ from scipy.special import j1
 from torch.autograd import gradcheck, gradgradcheck
 
 from dolens.analysis.modulation_transfer import diffraction_limited_transfer, modulation_transfer
-from dolens.analysis.ray_intercepts import uniform_pupil_points
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.errors import InputError
 
 

@@ -8,6 +8,7 @@ import torch
 from scipy.special import j1
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.analysis.modulation_transfer import diffraction_limited_transfer
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.huygens import huygens_irradiance, huygens_modulation, huygens_point_spread
@@ -42,7 +43,8 @@ def test_airy_s_pattern_and_its_sampling_error(rays):
     options = {"cells": 24, "half_width_um": 60.0}
     if rays:  # sums so coarse that they err by some of their estimates
         options = {"cells": 15, "half_width_um": 40.0, "rays": rays}
-    found = huygens_point_spread(hyperbola(100.0, 1.0), AXIS, [WAVELENGTH], **options)
+    lens = hyperbola(100.0, 1.0)
+    found = huygens_point_spread(lens, conditions(lens, AXIS, [WAVELENGTH]), **options)
     peak = 1e-6 * math.pi / (LAMBDA * 100.0) ** 2
     expected = jinc(2.0 * math.pi / LAMBDA / 100.0 * cells(found)) ** 2
     wrong = float(np.abs(found.irradiance[0].numpy() / peak - expected).max())
@@ -59,8 +61,12 @@ def test_airy_s_pattern_and_its_sampling_error(rays):
 def test_a_ring_s_pattern(inner):
     """[2J₁(v)/v - ε²·2J₁(εv)/(εv)]²/(1 - ε²)² (Born and Wolf, 8.6.2)."""
     stop = ClearAperture(Circle(1.0), Circle(inner))
+    lens = hyperbola(100.0, stop)
     found = huygens_point_spread(
-        hyperbola(100.0, stop), AXIS, [WAVELENGTH], cells=24, half_width_um=60.0
+        lens,
+        conditions(lens, AXIS, [WAVELENGTH]),
+        cells=24,
+        half_width_um=60.0,
     )
     v = 2.0 * math.pi / LAMBDA / 100.0 * cells(found)
     expected = ((jinc(v) - inner**2 * jinc(inner * v)) / (1.0 - inner**2)) ** 2
@@ -104,7 +110,9 @@ def test_a_tilted_image_keeps_its_light_and_stretches():
         "2": {"type": "coordinate_break", "tilt_x": 60.0},
     }
     lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 0.0}})
-    found = huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=24, half_width_um=150.0)
+    found = huygens_point_spread(
+        lens, conditions(lens, AXIS, [WAVELENGTH]), cells=24, half_width_um=150.0
+    )
     assert float(found.held) == pytest.approx(0.93, abs=0.04)
     place = (torch.arange(24).double() + 0.5) * (300.0 / 24) - 150.0
     x, y = 1e-3 * place[None].numpy(), 1e-3 * place[:, None].numpy() * math.cos(math.radians(60.0))
@@ -120,9 +128,10 @@ def test_both_ways_agree_for_the_triplet(root):
     """
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     field = [(0.0, 20.0)]
-    sums = huygens_point_spread(lens, field, [587.5618], cells=17, half_width_um=30.0)
+    where = conditions(lens, field, [587.5618])
+    sums = huygens_point_spread(lens, where, cells=17, half_width_um=30.0)
     # At the centres of as many cells: the mean over a fifteenth of each.
-    fine = point_spread(lens, field, [587.5618], cells=17 * 15, half_width_um=30.0)
+    fine = point_spread(lens, where, cells=17 * 15, half_width_um=30.0)
     transform = fine.irradiance[0, 7::15, 7::15]
     wrong = (sums.irradiance[0] - transform).abs().max() / transform.max()
     assert float(wrong) < 2.0 * float(sums.sampling_error) + float(fine.sampling_error)
@@ -132,27 +141,28 @@ def test_both_ways_agree_for_the_triplet(root):
 
 def test_a_near_object_s_image_is_perfect_too():
     """Two hyperboloids relay the axial point at 1:1 and F/6."""
-    found = huygens_point_spread(
-        relay(60.0), AXIS, [WAVELENGTH], 60.0, cells=24, half_width_um=12.0
-    )
+    lens = relay(60.0)
+    where = conditions(lens, AXIS, [WAVELENGTH], 60.0)
+    found = huygens_point_spread(lens, where, cells=24, half_width_um=12.0)
     assert float(found.strehl_ratio) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_fewer_rays_than_half_turns_are_refused():
     lens = hyperbola(100.0, 2.0)
+    where = conditions(lens, AXIS, [WAVELENGTH])
     with pytest.raises(InputError, match="differ by more than half a turn; give 1"):
-        huygens_point_spread(lens, AXIS, [WAVELENGTH], half_width_um=1000.0, rays=64)
+        huygens_point_spread(lens, where, half_width_um=1000.0, rays=64)
     with pytest.raises(InputError, match="too many to add up"):
-        huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=512, rays=1024)
+        huygens_point_spread(lens, where, cells=512, rays=1024)
     with pytest.raises(InputError, match="two cells"):
-        huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=1)
+        huygens_point_spread(lens, where, cells=1)
 
 
 def test_mtf_is_the_overlap_of_two_pupils():
     lens = hyperbola(100.0, 2.5)
     cutoff = 1.0 / (LAMBDA * 20.0)
     frequencies = cutoff * torch.tensor([0.0, 0.2, 0.5, 0.8]).double()
-    found = huygens_modulation(lens, AXIS, [WAVELENGTH], frequencies)
+    found = huygens_modulation(lens, conditions(lens, AXIS, [WAVELENGTH]), frequencies)
     expected = diffraction_limited_transfer(frequencies, WAVELENGTH, 20.0)
     for curve in (found.tangential[0], found.sagittal[0]):
         wrong = (curve - expected).abs()
@@ -165,8 +175,9 @@ def test_mtf_is_the_overlap_of_two_pupils():
 def test_mtf_by_wavelets_is_the_autocorrelation_s(root):
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     frequencies = [20.0, 50.0, 100.0]
-    sums = huygens_modulation(lens, [(0.0, 0.0)], [587.5618], frequencies)
-    other = diffraction_modulation(lens, [(0.0, 0.0)], [587.5618], frequencies)
+    where = conditions(lens, [(0.0, 0.0)], [587.5618])
+    sums = huygens_modulation(lens, where, frequencies)
+    other = diffraction_modulation(lens, where, frequencies)
     allowed = float(sums.sampling_error + other.sampling_error)
     for one, two in ((sums.tangential, other.tangential), (sums.sagittal, other.sagittal)):
         assert float((one - two).abs().max()) < allowed

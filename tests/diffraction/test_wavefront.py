@@ -8,6 +8,7 @@ import torch
 from scipy.integrate import dblquad
 
 from dolens import Lens, load_lens
+from dolens.analysis.conditions import conditions
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.diffraction.entrance_beam import ObjectPoints, find_beam
 from dolens.diffraction.pupil_fit import chebyshev, fit_pupil
@@ -80,7 +81,9 @@ def test_defocus_on_any_sphere_is_the_distance_to_the_focus(radius):
 
 def test_two_spheres_cut_the_same_rays(triplet):
     points = ObjectPoints.at_infinity([[3.0, 14.0]])
-    chief = trace_ray_intercepts(triplet, [(3.0, 14.0)], [587.5618], torch.zeros(1, 2), exact=True)
+    chief = trace_ray_intercepts(
+        triplet, conditions(triplet, [(3.0, 14.0)], [587.5618]), torch.zeros(1, 2), exact=True
+    )
     found = pupil_wavefront(triplet.system(), points, 587.5618, samples=16)
     assert torch.allclose(found.centre, chief.chief, atol=1e-10)
     radius = 1.0 / float(found.curvature)

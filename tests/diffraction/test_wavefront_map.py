@@ -7,9 +7,9 @@ import torch
 from scipy.integrate import quad
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.diffraction.point_spread import marechal, strehl_ratios
 from dolens.diffraction.wavefront_map import wavefront_maps
-from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 
 WAVELENGTH = 500.0
@@ -31,7 +31,7 @@ def mirror(radius=1000.0, aperture=20.0, conic=0.0, defocus=0.0):
 
 
 def coefficients(lens, field=(0.0, 0.0), order="fringe", **options):
-    maps = wavefront_maps(lens, [field], [WAVELENGTH], **options)
+    maps = wavefront_maps(lens, conditions(lens, [field], [WAVELENGTH]), **options)
     fit = maps.zernike(order)
     return dict(zip(fit.names, fit.coefficients[0, 0].tolist(), strict=True)), maps
 
@@ -104,7 +104,7 @@ def test_balanced_spherical_aberration_and_its_strehl_ratio(waves):
     found, maps = coefficients(lens, samples=128)
     assert float(maps.rms) == pytest.approx(waves / (6.0 * math.sqrt(5.0)), rel=3e-3)
     assert abs(found["defocus"]) < 5e-3 * waves
-    ratios = strehl_ratios(lens, [(0.0, 0.0)], [WAVELENGTH])
+    ratios = strehl_ratios(lens, conditions(lens, [(0.0, 0.0)], [WAVELENGTH]))
     parts = [
         quad(lambda t, f=f: f(2.0 * math.pi * waves * (t * t - t)), 0.0, 1.0)[0]
         for f in (math.cos, math.sin)
@@ -125,7 +125,7 @@ def test_marechal_s_formula():
 def test_hubble_s_telescope_has_no_coma(root):
     """A Ritchey-Chrétien; a paraboloid of the same aperture and F-number has θa/(16N²) of it."""
     lens = load_lens(root / "conf/lens/published/ritchey_chretien_hst.yaml").requires_grad_(False)
-    maps = wavefront_maps(lens, [(0.0, 0.0), (0.0, 0.1)], [632.8])
+    maps = wavefront_maps(lens, conditions(lens, [(0.0, 0.0), (0.0, 0.1)], [632.8]))
     fit = maps.zernike()
     paraboloid = math.radians(0.1) * 1200.0 / (16.0 * 24.0**2) / 632.8e-6 / 3.0
     coma = fit.coefficients[1, 0, fit.names.index("coma y")]
@@ -143,7 +143,7 @@ def test_the_triplet_s_coefficients_are_optiland_s(root, reference):
     document = reference("zernike_optiland.json")
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     fields = [(0.0, case["field"]) for case in document["cases"]]
-    maps = wavefront_maps(lens, fields, [document["wavelength_nm"]], samples=48)
+    maps = wavefront_maps(lens, conditions(lens, fields, [document["wavelength_nm"]]), samples=48)
     for order in ("fringe", "standard"):
         found = maps.zernike(order).coefficients[:, 0]
         expected = torch.tensor([case[order] for case in document["cases"]]).double()
@@ -157,7 +157,7 @@ def test_the_triplet_s_coefficients_are_optiland_s(root, reference):
 def test_standard_coefficients_sum_to_the_variance(root):
     """Over the full disc, without piston; the axis of the triplet is not vignetted."""
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
-    maps = wavefront_maps(lens, [(0.0, 0.0)], [587.5618])
+    maps = wavefront_maps(lens, conditions(lens, [(0.0, 0.0)], [587.5618]))
     found = maps.zernike("standard").coefficients[0, 0, 1:]
     assert float(found.square().sum().sqrt()) == pytest.approx(float(maps.rms), rel=5e-4)
 
@@ -165,7 +165,7 @@ def test_standard_coefficients_sum_to_the_variance(root):
 def test_a_folded_mirror_has_the_wavefront_of_the_straight_one(root):
     """The Newtonian's flat turns the light by 90°; its paraboloid is perfect on the axis."""
     lens = load_lens(root / "conf/lens/published/newtonian_200_f5.yaml").requires_grad_(False)
-    maps = wavefront_maps(lens, [(0.0, 0.0), (0.0, 0.1)], [550.0])
+    maps = wavefront_maps(lens, conditions(lens, [(0.0, 0.0), (0.0, 0.1)], [550.0]))
     assert float(maps.rms[0]) < 1e-3
     fit = maps.zernike()
     w131 = math.radians(0.1) * 100.0**3 / 2000.0**2 / 550e-6
@@ -176,10 +176,8 @@ def test_a_folded_mirror_has_the_wavefront_of_the_straight_one(root):
 
 def test_fields_without_light_are_nan_and_spoil_no_other(root):
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
-    maps = wavefront_maps(lens, [(0.0, 80.0), (0.0, 5.0)], [587.5618], samples=24)
+    maps = wavefront_maps(lens, conditions(lens, [(0.0, 80.0), (0.0, 5.0)], [587.5618]), samples=24)
     fit = maps.zernike()
     assert math.isnan(float(maps.rms[0])) and math.isnan(float(maps.peak_to_valley[0]))
     assert bool(fit.coefficients[0].isnan().all())
     assert bool(fit.coefficients[1].isfinite().all())
-    with pytest.raises(InputError, match="fields must be pairs"):
-        wavefront_maps(lens, [], [587.5618])

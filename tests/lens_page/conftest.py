@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from dolens.lens_page.overview import prepared_lens
 from dolens.lens_page.page import write_page
 from dolens.prescriptions import lens_from_prescription
 from tests.prescriptions.samples import SINGLET
@@ -80,9 +81,8 @@ def page(hostile_lens, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     path = folder / "page.html"
     written = write_page(
-        hostile_lens,
+        prepared_lens(hostile_lens, f_number=4.0),
         path,
-        f_number=4.0,
         tolerances="default",
         figures=folder / "figures",
         command="dolens show '</code><script>'",

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, Status
+from dolens.analysis.conditions import field_scans
 from dolens.analysis.field_curves import parabasal_rays
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.optics.aiming import field_line
@@ -177,8 +178,9 @@ def test_aimed_rays_from_the_side_have_their_derivatives():
 def test_what_needs_a_tangent_refuses_fields_from_the_side():
     """Each says in one line that fields must be below 90 degrees."""
     lens = fisheye()
+    (scan,) = field_scans(lens, edge=95.0, count=2)
     with pytest.raises(InputError, match="below 90 degrees"):
-        parabasal_rays(lens, [[0.0, 95.0]], [WAVE])
+        parabasal_rays(lens, scan, [WAVE])
     with pytest.raises(InputError, match="90 degrees"):
         ObjectPoints.at_infinity([[0.0, 95.0]])
     front = {"1": {"type": "sphere", "radius": 30.0, "semi_diameter": 5.0, "material": "1.5/60"}}

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens
-from dolens.analysis.conditions import field_scans
+from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.plotting import (
     before_after_figure,
@@ -46,7 +46,7 @@ def test_field_curves_name_the_unit_of_each_state(states):
     curves = {}
     for name, lens in states.items():
         scan = field_scans(lens, lens.object_distance)[0]
-        curves[name] = field_curves(lens, scan, [587.5618], lens.object_distance)
+        curves[name] = field_curves(lens, scan, [587.5618])
     figure = states_field_curves_figure(curves)
     assert [axes.get_ylabel() for axes in figure.axes[:3]] == ["field (degrees)", "", "field (mm)"]
 
@@ -61,7 +61,7 @@ LINES = (656.2725, 587.5618, 486.1327)
 
 def test_the_section_names_fields_in_the_lens_s_own_unit(triplet):
     fields = torch.tensor([[0.0, 0.0], [0.0, -80.0], [5.0, 5.0]], dtype=torch.float64)
-    figure = lens_section_figure(triplet, fields, LINES, "mm", 500.0)
+    figure = lens_section_figure(triplet, conditions(triplet, fields, LINES, 500.0))
     assert legend(figure) == ["0 mm", "−80 mm"]
     # Light from below the axis rises.
     path = by_gid(figure.axes[0], "ray")[-1]

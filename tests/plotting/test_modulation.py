@@ -5,6 +5,7 @@ import math
 import numpy as np
 import torch
 
+from dolens.analysis.conditions import conditions
 from dolens.analysis.modulation_transfer import Modulation, modulation
 from dolens.plotting import (
     modulation_figure,
@@ -43,7 +44,9 @@ WAVES = [656.2725, 587.5618, 486.1327]
 def test_fields_on_both_sides_of_a_lens_share_their_entry_and_have_a_minus(triplet):
     fields = [(0.0, 0.0), (14.0, 0.0), (-14.0, 0.0)]
     frequencies = torch.linspace(0.0, 60.0, 11, dtype=torch.float64)
-    figure = modulation_figure(modulation(triplet, fields, WAVES, frequencies, rays=200))
+    figure = modulation_figure(
+        modulation(triplet, conditions(triplet, fields, WAVES), frequencies, rays=200)
+    )
     labels = legend(figure)
     assert labels[:2] == ["0°", "(14, 0)°, (−14, 0)°"]
     assert not flaws(figure)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from dolens.analysis.conditions import conditions
 from dolens.analysis.encircled_energy import encircled_energy
 from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.diffraction.point_spread import diffraction_encircled_energy, point_spread
@@ -28,22 +29,23 @@ DARK = [(0.0, 0.0), (0.0, 45.0)]
 
 def test_fields_without_light_are_named_so(triplet):
     frequency = [0.0, 20.0, 40.0]
-    mtf = diffraction_modulation(triplet, DARK, LINES[1:2], frequency)
+    where = conditions(triplet, DARK, LINES[1:2])
+    mtf = diffraction_modulation(triplet, where, frequency)
     assert "45° (no light passes)" in legend(modulation_comparison_figure(mtf))
-    waves = diffraction_encircled_energy(triplet, DARK, LINES[1:2], [5.0, 10.0])
-    rays = encircled_energy(triplet, DARK, LINES[1:2], [5.0, 10.0], rays=40)
+    waves = diffraction_encircled_energy(triplet, where, [5.0, 10.0])
+    rays = encircled_energy(triplet, where, [5.0, 10.0], rays=40)
     figure = encircled_energy_figure(waves, rays)
     assert "45° (no light passes)" in legend(figure)
     drawn = [np.asarray(line.get_ydata()) for line in by_gid(figure.axes[0], "energy")]
     assert sum(bool(np.isfinite(line).all()) for line in drawn) == 2
-    psf = point_spread(triplet, DARK, LINES[1:2], cells=32)
+    psf = point_spread(triplet, where, cells=32)
     titles = [axes.get_title() for axes in point_spread_figure(psf).axes]
     assert titles[0].startswith("0°\nStrehl ratio 0.2")
     assert titles[1] == "45°\nno light passes"
 
 
 def test_point_spread_functions_have_axes_in_micrometres(triplet):
-    psf = point_spread(triplet, [(0.0, 14.0)], LINES[1:2], cells=32)
+    psf = point_spread(triplet, conditions(triplet, [(0.0, 14.0)], LINES[1:2]), cells=32)
     figure = point_spread_figure(psf, None)
     axes = figure.axes[0]
     (picture,) = axes.images

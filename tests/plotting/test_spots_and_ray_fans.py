@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_intercepts import RayFans, ray_fans
 from dolens.analysis.spot_diagram import (
@@ -37,7 +38,9 @@ def texts(axes):
 
 @pytest.fixture(scope="module")
 def spots(triplet):
-    return spot_diagram(triplet, [(0.0, 0.0), (0.0, 14.0), (0.0, 35.0)], LINES, rays=80)
+    return spot_diagram(
+        triplet, conditions(triplet, [(0.0, 0.0), (0.0, 14.0), (0.0, 35.0)], LINES), rays=80
+    )
 
 
 def test_spots_are_drawn_about_the_common_centroid_in_micrometres(spots):
@@ -117,7 +120,7 @@ FOUR_FIELDS = [(0.0, 0.0), (0.0, 10.0), (0.0, 14.0), (0.0, 20.0)]
 
 @pytest.fixture(scope="module")
 def triplet_spots(triplet):
-    return spot_diagram(triplet, FOUR_FIELDS, WAVES, rays=200)
+    return spot_diagram(triplet, conditions(triplet, FOUR_FIELDS, WAVES), rays=200)
 
 
 @pytest.mark.parametrize("overlaid", [False, True])
@@ -129,7 +132,7 @@ def test_numbers_of_spots_stand_beside_them(triplet_spots, overlaid):
 def test_no_airy_disc_is_cut():
     """The camera lens's discs lie beside their fields' centres by its lateral colour."""
     nikon = load_lens("nikon_optimized").requires_grad_(False)
-    spots = spot_diagram(nikon, [(0.0, 0.0), (0.0, 32.45)], WAVES, rays=100)
+    spots = spot_diagram(nikon, conditions(nikon, [(0.0, 0.0), (0.0, 32.45)], WAVES), rays=100)
     figure = spots_figure(spots)
     assert not flaws(figure)
     for axes in figure.axes:
@@ -158,15 +161,19 @@ def test_spots_before_and_after_share_their_scale_and_small_ones_are_magnified(t
 
 
 def test_fans_curves_and_contrast(triplet):
-    assert not flaws(ray_fans_figure(ray_fans(triplet, FOUR_FIELDS, WAVES), "Fans", pupil=0.6))
+    assert not flaws(
+        ray_fans_figure(
+            ray_fans(triplet, conditions(triplet, FOUR_FIELDS, WAVES)), "Fans", pupil=0.6
+        )
+    )
     curves = rms_curves_figure(
-        rms_against_field(triplet, WAVES, (0.0, 20.0), 5, 100),
-        rms_against_wavelength(triplet, FOUR_FIELDS, (486.0, 656.0), 5, 100),
+        rms_against_field(triplet, conditions(triplet, wavelengths=WAVES), (0.0, 20.0), 5, 100),
+        rms_against_wavelength(triplet, conditions(triplet, FOUR_FIELDS), (486.0, 656.0), 5, 100),
     )
     assert not flaws(curves)
     frequencies = torch.linspace(0.0, 60.0, 11, dtype=torch.float64)
     six = [(0.0, y) for y in (0.0, 5.0, 9.0, 12.0, 16.0, 20.0)]
-    found = modulation(triplet, six, WAVES, frequencies, rays=200)
+    found = modulation(triplet, conditions(triplet, six, WAVES), frequencies, rays=200)
     figure = modulation_figure({"initial": found, "final": found}, "MTF")
     assert not flaws(figure)
     left, right = figure.axes

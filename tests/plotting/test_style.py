@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.optics.fields import field_label
 from dolens.plotting import (
     before_after_figure,
@@ -166,10 +167,12 @@ LINES = (656.2725, 587.5618, 486.1327)
 
 
 def test_captions_name_lens_aperture_and_light(triplet):
-    assert caption("Fans", triplet, LINES) == "Fans: Cooke triplet, F/4.93, 486.1, 587.6, 656.3 nm"
-    long = caption("Point spread functions", triplet, LINES)
+    far = conditions(triplet, wavelengths=LINES)
+    assert caption("Fans", triplet, far) == "Fans: Cooke triplet, F/4.93, 486.1, 587.6, 656.3 nm"
+    long = caption("Point spread functions", triplet, far)
     assert long == "Point spread functions: Cooke triplet,\nF/4.93, 486.1, 587.6, 656.3 nm"
-    assert "working F/" in caption("Fans", triplet, LINES, 500.0)
+    near = conditions(triplet, object_distance=500.0)
+    assert "working F/" in caption("Fans", triplet, near)
     assert wavelengths_text([587.5618]) == "587.6 nm"
     assert wavelengths_text(range(400, 800, 100)) == "4 wavelengths from 400 to 700 nm"
     assert plain_text("a\nb $c$") == r"a b \$c\$"

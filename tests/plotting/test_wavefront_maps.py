@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from dolens.analysis.conditions import field_scans
+from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.footprint import footprint
 from dolens.diffraction.point_spread import strehl_ratios
 from dolens.diffraction.wavefront_map import wavefront_maps
@@ -18,7 +18,7 @@ FIELDS = [(0.0, 0.0), (0.0, 20.0), (0.0, 45.0)]
 
 @pytest.fixture(scope="module")
 def maps(triplet):
-    return wavefront_maps(triplet, FIELDS, [587.5618], samples=32)
+    return wavefront_maps(triplet, conditions(triplet, FIELDS, [587.5618]), samples=32)
 
 
 def test_a_map_shows_waves_over_the_stop_on_a_scale_about_zero(maps):
@@ -51,7 +51,7 @@ def test_bars_are_the_coefficients_with_their_names(maps):
 
 def test_strehl_ratios_lie_between_none_and_one(triplet):
     (scan,) = field_scans(triplet, None, 20.0, 3)
-    found = strehl_ratios(triplet, scan, [587.5618])
+    found = strehl_ratios(triplet, conditions(triplet, scan.fields, [587.5618]))
     figure = strehl_figure([(scan, found)])
     (axes,) = figure.axes
     lines = {line.get_gid(): line for line in axes.lines}
@@ -62,7 +62,7 @@ def test_strehl_ratios_lie_between_none_and_one(triplet):
 
 
 def test_footprints_have_a_panel_for_each_surface_and_its_outline(triplet):
-    found = footprint(triplet, FIELDS, rays=200)
+    found = footprint(triplet, conditions(triplet, FIELDS), rays=200)
     figure = footprint_figure(found)
     panels = [axes for axes in figure.axes if axes.get_visible()]
     assert len(panels) == 6

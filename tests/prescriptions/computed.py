@@ -125,7 +125,7 @@ def _beams(lens: Lens) -> list[Tensor]:
 
 def _spots(lens: Lens) -> list[Tensor]:
     seen = conditions(lens)
-    spots = spot_diagram(lens, seen.fields, seen.wavelengths, _RAYS, seen.object_distance)
+    spots = spot_diagram(lens, seen, _RAYS)
     square = spots.polychromatic_rms.square()
     return [spots.rms, spots.chief, square, (seen.field_weights * square).sum()]
 

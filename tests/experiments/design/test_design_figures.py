@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from overlaps import flaws
 
+from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.experiments.design.merit_rays import rays_text, reference_text
 from dolens.experiments.design.spot_tables import spot_table
@@ -30,7 +31,7 @@ def test_the_spots_are_of_the_very_rays_of_the_headline(module):
     assert rms == pytest.approx(headline, rel=1e-9)
     title = figure.get_suptitle()
     assert f"mean RMS radius {headline:.4g} µm, 31×31 rays over ±15 mm" in title
-    whole = spot_diagram(module.lens, [(0.0, 0.0)], [532.8]).rms
+    whole = spot_diagram(module.lens, conditions(module.lens, [(0.0, 0.0)], [532.8])).rms
     printed = float(title.partition("over the whole stop: ")[2].partition(" ")[0])
     assert printed == pytest.approx(1e3 * float(whole), rel=5e-3)
     far = np.linalg.norm(points, axis=1).max()

@@ -91,7 +91,7 @@ def test_what_others_refuse_is_named_by_its_setting():
 
 def test_a_merit_without_fields_is_refused():
     with pytest.raises(InputError, match=r"merit\.fields: is an empty list"):
-        MeritSettings(fields=[]).fields_of(lightning.LightningModule())
+        MeritSettings(fields=[]).conditions_of(lightning.LightningModule())
 
 
 def test_a_setting_is_named_as_the_user_wrote_it_where_another_one_refers_to_it(camera):

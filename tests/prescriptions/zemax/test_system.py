@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dolens import InputError, Rays
+from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
 from dolens.prescriptions.zemax.writer import zemax_of
@@ -142,7 +143,7 @@ def test_a_diameter_that_is_drawn_clips_nothing(tmp_path):
 def test_vignetting_factors_narrow_the_beam_of_their_field(tmp_path):
     head = "ENPD 6\nFTYP 0 0 2 1\nYFLN 0 5\nVCYN 0 0.5\n"
     lens = lens_of(singlet(*GOOD, head=head, last=""), tmp_path)
-    spots = spot_diagram(lens, lens.fields.points, [550.0])
+    spots = spot_diagram(lens, conditions(lens, lens.fields.points, [550.0]))
     light = (spots.valid * spots.weight).flatten(1).sum(1) / spots.weight.sum()
     assert float(light[0]) > 0.99
     assert float(light[1]) == pytest.approx(0.5, abs=0.05)
