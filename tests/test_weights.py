@@ -20,7 +20,7 @@ from dolens.experiments.design.merit_rays import (
     merit_rms_against_field,
     merit_spots,
 )
-from dolens.experiments.design.spot_tables import spot_table
+from dolens.experiments.design.states import spot_table
 from dolens.experiments.settings import PupilRays, Spots
 from dolens.experiments.tolerances.tolerances import MonteCarlo, TolerancesModule
 from dolens.lens_page.offenders import offenders

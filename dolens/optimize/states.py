@@ -19,8 +19,7 @@ from dolens.optics.lens_states import state_temperature, values_there
 from dolens.optics.parameter_names import STATES, names_of_state, split_state, values_in_state
 from dolens.optimize.image_quality import ImageQuality, QualityValues
 from dolens.optimize.linear_least_squares import LinearModel
-from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operand_values import OperandValue
+from dolens.optimize.merit import MeritFunction, OperandValue
 from dolens.optimize.variables import DesignVariables
 
 

@@ -25,7 +25,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optimize.linear_least_squares import LinearModel, bounded_step
-from dolens.optimize.operand_values import OperandModel
+from dolens.optimize.merit import OperandModel
 from dolens.optimize.variables import DesignVariables
 
 # Of the strongest variable's effect: variables are damped as if they moved rays by no less.

@@ -7,7 +7,7 @@ import lightning
 
 from dolens.errors import InputError
 from dolens.experiments.design.design import DesignModule
-from dolens.experiments.design.spot_tables import operand_table
+from dolens.experiments.design.iteration import operand_table
 from dolens.experiments.tables import write_table
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens

@@ -16,8 +16,7 @@ from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.optimize import DampedLeastSquares
 from dolens.optimize.deconvolved_error import DeconvolvedError, Photographs
-from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operand_values import OperandModel, evaluate_operands
+from dolens.optimize.merit import MeritFunction, OperandModel, evaluate_operands
 from dolens.optimize.operands import UnreachableField, check_operand_fields, operand
 from dolens.optimize.ray_intercept_quality import LossResiduals
 from dolens.optimize.variables import DesignVariables

@@ -17,9 +17,9 @@ from dolens.experiments.design.design_figures import design_figures, history_fig
 from dolens.experiments.design.iteration import (
     Progress,
     gradient_iteration,
+    iteration_row,
     least_squares_iteration,
 )
-from dolens.experiments.design.spot_tables import iteration_row, spot_metrics
 from dolens.experiments.design.states import (
     entrance_pupils,
     fit_edges,
@@ -27,6 +27,7 @@ from dolens.experiments.design.states import (
     refuse_lost_light,
     set_entrance_pupils,
     set_foci,
+    spot_metrics,
     state_metrics,
 )
 from dolens.experiments.experiment import Experiment, Figures

@@ -21,8 +21,7 @@ from dolens.experiments.design.merit_rays import (
     reference_text,
     whole_stop_rms,
 )
-from dolens.experiments.design.spot_tables import spot_table
-from dolens.experiments.design.states import views
+from dolens.experiments.design.states import spot_table, views
 from dolens.experiments.experiment import Figures
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens

@@ -1,4 +1,4 @@
-"""One iteration of a design, by least squares or by a gradient."""
+"""One iteration of a design, by least squares or by a gradient, and its numbers as tables."""
 
 import math
 import time
@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.experiments.design.states import spot_labels
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritFunction
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.merit import MeritValue
@@ -160,3 +161,52 @@ def gradient_iteration(
         "failed_trials": float(failed),
     }
     return Progress(merit(), numbers, counted.cost)
+
+
+def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> dict[str, float]:
+    """Return the numbers of an iteration, by the names that they are logged under."""
+    value, cost = progress.value, progress.cost
+    row = {
+        "train/merit": value.sum_of_squares(),
+        **{f"train/{name}": number for name, number in progress.numbers.items()},
+        "cost/iteration_s": seconds,
+        "cost/jacobian_s": cost.jacobian_s,
+        "cost/iteration_rays": float(cost.rays),
+        "cost/evaluations": float(cost.evaluations),
+    }
+    if value.qualities:
+        row["train/quality"] = sum(found.merit for found in value.qualities.values())
+    for state, found in value.qualities.items():
+        quality = merit.qualities[state]
+        before = f"spot_{quality.unit}/" + ("" if state is None else f"{state}/")
+        for label, rms in zip(spot_labels(quality.spots), found.rms.tolist(), strict=True):
+            row[before + label] = quality.scale * rms
+    if value.operands:
+        slopes = value.operand_derivatives().norm(dim=1).tolist()
+        for item, slope in zip(value.operands, slopes, strict=True):
+            row[f"operand/{item.label}"] = item.value
+            row[f"operand_slope/{item.label}"] = slope
+            row[f"merit/{item.label}"] = (item.weight * item.deviation) ** 2
+    return row
+
+
+def operand_table(merit: MeritFunction) -> list[dict[str, Any]]:
+    """Return rows, one for every operand: value, deviation, derivatives by variable.
+
+    Derivatives are those of the value with respect to each variable in the unit of files.
+    """
+    value = merit()
+    if not value.operands:
+        return []
+    slopes = (value.operand_derivatives() / merit.variables.file_scale.cpu()).tolist()
+    labels = merit.variables.labels()
+    return [
+        {
+            "operand": item.label,
+            "value": item.value,
+            "deviation": item.deviation,
+            "weight": item.weight,
+            **dict(zip(labels, row, strict=True)),
+        }
+        for item, row in zip(value.operands, slopes, strict=True)
+    ]

@@ -30,7 +30,7 @@ from dolens.analysis.spot_diagram import (
 )
 from dolens.diffraction.modulation_transfer import diffraction_modulation
 from dolens.errors import InputError
-from dolens.experiments.design.spot_tables import SQUARE_GRID_COUNT, spot_table
+from dolens.experiments.design.states import SQUARE_GRID_COUNT, spot_table
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order

@@ -2,13 +2,14 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.experiments.design.spot_tables import SpotTable, spot_labels, spot_metrics, spot_table
 from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
@@ -17,6 +18,87 @@ from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters, rim_
 from dolens.optimize.image_quality import ImageQuality
 
 logger = logging.getLogger(__name__)
+
+SQUARE_GRID_COUNT = 31
+_DEFAULTS = {
+    "gaussian_quadrature": {"rings": 6, "arms": 12},
+    "square_grid": {"count": SQUARE_GRID_COUNT},
+}
+
+
+@dataclass(frozen=True)
+class SpotTable:
+    """Holds the RMS spot radii of a lens.
+
+    Attributes:
+        radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
+        mean: of all, with the merit's weights.
+        light: share of the beams that passes, likewise; see `SpotRays.light`.
+    """
+
+    radii: dict[str, float]
+    mean: float
+    light: float
+
+
+def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> SpotTable:
+    """Return the RMS spot radii of a lens, over the rays that pass it.
+
+    Args:
+        lens: initial, published or final.
+        settings: of a merit of spots.
+        finer: twice the rays in each direction, to see what the sampling costs.
+    """
+    if finer:
+        settings = replace(settings, sampling_options=_doubled(settings))
+    quality = settings.image_quality(lens)
+    rms = 1e3 * quality.values(lens).rms
+    mean = float((quality.weights.to(rms) * rms).sum())
+    light = float((quality.weights.to(quality.spots.light) * quality.spots.light).sum())
+    radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
+    return SpotTable(radii, mean, light)
+
+
+def spot_metrics(
+    lens: Lens, others: Mapping[str, Lens], settings: MeritSettings
+) -> dict[str, float]:
+    """Return mean RMS spot radii and light of a design and others, and radii of all its spots.
+
+    Args:
+        lens: the design, `final` in the names of metrics.
+        others: lenses to compare with, by their names there.
+        settings: of a merit of spots.
+    """
+    final = spot_table(lens, settings)
+    tables = {name: spot_table(other, settings) for name, other in others.items()}
+    tables["final"] = final
+    numbers = {}
+    for name, table in tables.items():
+        numbers[f"rms_spot_um/{name}"] = table.mean
+        numbers[f"light/{name}"] = table.light
+    for label, radius in final.radii.items():
+        numbers[f"rms_spot_um/final/{label}"] = radius
+    numbers["error/sampling_um"] = abs(spot_table(lens, settings, finer=True).mean - final.mean)
+    logger.info(
+        "RMS spot radius, mean of %d: %s µm",
+        len(final.radii),
+        ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
+    )
+    return numbers
+
+
+def spot_labels(spots: SpotRays) -> list[str]:
+    """Return the label of every spot, as `x,y/588nm`."""
+    fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
+    return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
+
+
+def _doubled(settings: MeritSettings) -> dict[str, Any]:
+    """Return sampling options with twice the rays along each direction."""
+    given = {key: value for key, value in settings.sampling_options.items() if value is not None}
+    options = {**_DEFAULTS[settings.sampling], **given}
+    counts = ("rings", "arms", "count")
+    return {key: 2 * value if key in counts else value for key, value in options.items()}
 
 
 def views(lens: Lens, settings: MeritSettings) -> dict[str, Lens]:

@@ -9,7 +9,7 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_rings
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.optimize.operand_values import evaluate_operands
+from dolens.optimize.merit import evaluate_operands
 from dolens.optimize.operands import operand
 from dolens.prescriptions import lens_from_prescription
 from scripts.designs.files import Design, Surface

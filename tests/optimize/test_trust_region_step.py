@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.optimize.operand_values import OperandModel
+from dolens.optimize.merit import OperandModel
 from dolens.optimize.operands import LensProperties, Operand, operand
 from dolens.optimize.trust_region_step import ray_moves, trust_region_step
 from dolens.optimize.variables import DesignVariables

@@ -5,7 +5,7 @@ import torch
 
 from dolens.experiments.camera.lens_merit import CameraOperands
 from dolens.optics.aiming import aim
-from dolens.optimize import operand_values
+from dolens.optimize import merit
 from tests.experiments.camera.test_field_views import doublet
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET, UNTESTED
 
@@ -49,10 +49,8 @@ def test_a_camera_hands_its_scenes_distance_to_its_operands(made, trained, monke
     _, values = module.lens_steps.penalty(module.variables())
     expected = -float(order.efl / (700.0 + order.ffd))
     assert float(values["magnification"]) == pytest.approx(expected, rel=1e-4)
-    seen, properties = [], operand_values.LensProperties
-    monkeypatch.setattr(
-        operand_values, "LensProperties", lambda *a: seen.append(a[2]) or properties(*a)
-    )
+    seen, properties = [], merit.LensProperties
+    monkeypatch.setattr(merit, "LensProperties", lambda *a: seen.append(a[2]) or properties(*a))
     trained(*asked)
     assert set(seen) == {700.0}
 

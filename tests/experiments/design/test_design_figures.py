@@ -9,7 +9,7 @@ from overlaps import flaws
 from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.experiments.design.merit_rays import rays_text, reference_text
-from dolens.experiments.design.spot_tables import spot_table
+from dolens.experiments.design.states import spot_table
 from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 
