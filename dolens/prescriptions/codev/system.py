@@ -1,17 +1,22 @@
-"""The system data of a CODE V `.seq` file: units, aperture, fields, wavelengths, zoom positions.
+"""The system data of a CODE V `.seq` file are read and written: units, aperture, fields,
+wavelengths, zoom positions.
 
 What bends no ray is passed over, and listed.
 """
 
 import math
 import re
+from collections.abc import Mapping
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.codev.file import CodeVFile, Command, unquoted
-from dolens.prescriptions.numbers import exact, nearest, number_in_text, scaled
-from dolens.prescriptions.system_data import unequal_weights
+from dolens.prescriptions.numbers import exact, nearest, number_in_text, number_text, scaled
+from dolens.prescriptions.other_programs import written_wavelengths
+from dolens.prescriptions.system_data import PUPIL_KEYS, unequal_weights
 
 _UNITS = {"M": Fraction(1), "C": Fraction(10), "I": Fraction(127, 5)}
 _FIELDS = {
@@ -21,17 +26,21 @@ _FIELDS = {
     "RI": "real_image_heights",
 }
 _PUPILS = ("EPD", "FNO", "NA", "NAO")
+_WORDS = {
+    "entrance_pupil_diameter": "EPD",
+    "f_number": "FNO",
+    "working_f_number": "FNO",
+    "object_na": "NAO",
+}
 # Degrees Celsius and millimetres of mercury that CODE V's glass data are for.
 _USUAL_TEMPERATURES = (20.0, 22.0)
 _ATMOSPHERE = Fraction(760)
-# What the first of several positions must say as the lens itself does.
-_SYSTEM = ("EPD", "FNO", "NA", "NAO")
 # Lists of wavelengths and fields, one number each; `ZOO WTW W2 1 0` is about the second.
 _LISTS = (
     "WL",
     "WTW",
     "WTF",
-    *(f"{axis}{kind}" for axis in "XY" for kind in ("AN", "OB", "IM", "RI")),
+    *(f"{axis}{kind}" for axis in "XY" for kind in _FIELDS),
 )
 _LISTED = re.compile(r"[WF]([1-9]\d{0,2})")
 
@@ -191,6 +200,91 @@ def _last(file: CodeVFile, key: str) -> Command | None:
     return file.system[key][-1] if key in file.system else None
 
 
+def system_lines(prescription: Mapping[str, Any], where: str) -> list[str]:
+    """Return the lines of a file that `read_system` and `factor_to_mm` read back.
+
+    Raises:
+        InputError: a lens without an aperture, whose stop has no entrance pupil of finite size.
+    """
+    waves, reference = written_wavelengths(prescription, where)
+    weights = prescription.get("wavelength_weights")
+    lines = [
+        *_title_line(prescription),
+        *_pupil_lines(prescription, where),
+        "DIM   M",
+        f"WL    {_texts(waves, where)}",
+        f"REF   {reference}",
+        *([f"WTW   {_texts(weights, where)}"] if weights else []),
+        *_field_lines(prescription.get("fields") or {"angles": [[0.0, 0.0]]}, where),
+    ]
+    if prescription.get("temperature") is not None:
+        lines.append(f"TEM   {number_text(prescription['temperature'], where)}")
+    if prescription.get("pressure") is not None:
+        pressure = Decimal(number_text(prescription["pressure"], where)) * 760
+        lines.append(f"PRE   {pressure}")
+    return lines
+
+
+def _title_line(prescription: Mapping[str, Any]) -> list[str]:
+    name = str(prescription.get("name") or "")
+    if not name:
+        return []
+    quote = '"' if "'" in name else "'"
+    return [f"TITLE {quote}{name}{quote}"]
+
+
+def _pupil_lines(prescription: Mapping[str, Any], where: str) -> list[str]:
+    """Write the aperture: the prescription's own, or the entrance pupil of its stop."""
+    lines = ["TEL   Y"] if prescription.get("telecentric_object") else []
+    for key in PUPIL_KEYS:
+        if prescription.get(key) is not None and key in _WORDS:
+            return [*lines, f"{_WORDS[key]:5} {number_text(prescription[key], where)}"]
+    return [*lines, f"EPD   {_entrance_pupil(prescription, where)}"]
+
+
+def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
+    """Return the diameter of the entrance pupil, mm: the stop's own, or the next above it that has
+    a short text, so that the stop's size is what clips.
+    """
+    lens = lens_from_prescription(prescription, where=where).requires_grad_(False)
+    diameter = float(
+        lens.first_order(lens.primary_wavelength, meridian="y").entrance_pupil.diameter
+    )
+    if not math.isfinite(diameter) or diameter <= 0.0:
+        raise InputError(
+            f"{where}: a .seq file needs an aperture, and the stop of this lens has no entrance "
+            "pupil of finite size; give 'object_na'"
+        )
+    texts = (f"{diameter * (1.0 + margin):.12g}" for margin in (0.0, 1e-11, 1e-9))
+    return next(text for text in texts if float(text) >= diameter)
+
+
+def _field_lines(fields: Mapping[str, Any], where: str) -> list[str]:
+    kind, name = next((pair for pair in _FIELDS.items() if pair[1] in fields), ("AN", "angles"))
+    points = fields[name]
+    lines = []
+    for axis, letter in enumerate("XY"):
+        values = [point[axis] for point in points]
+        lines.append(f"{letter}{kind}   {_texts(values, where)}")
+    if fields.get("weights"):
+        lines.append(f"WTF   {_texts(fields['weights'], where)}")
+    for letter in "XY" if fields.get("vignetting") else "":
+        cut: dict[str, list[str]] = {"U": [], "L": []}
+        for row in fields["vignetting"]:
+            shift, part = (
+                Decimal(number_text(row.get(f"{name}_{letter.lower()}", 0.0), where))
+                for name in ("decenter", "compression")
+            )
+            cut["U"].append(str(part - shift))
+            cut["L"].append(str(part + shift))
+        lines += [f"V{end}{letter}   {' '.join(values)}" for end, values in cut.items()]
+    return lines
+
+
+def _texts(values: Any, where: str) -> str:
+    return " ".join(number_text(value, where) for value in values)
+
+
 def passed_over(file: CodeVFile) -> list[str]:
     """Return what a file says besides its lens, in words."""
     found = []
@@ -215,11 +309,11 @@ def require_first_position(file: CodeVFile, where: str) -> None:
     """
     for command in file.zoom:
         words = command.words
-        if len(words) < 3 or words[0].upper() not in (*_SYSTEM, *_LISTS, "THI"):
+        if len(words) < 3 or words[0].upper() not in (*_PUPILS, *_LISTS, "THI"):
             continue
         key, label = words[0].upper(), words[1].upper()
         place = f"{where}: line {command.at}: ZOO {key}"
-        if key in _SYSTEM:
+        if key in _PUPILS:
             own, first = file.system.get(key), words[1]
             value = own[-1].words[0] if own and own[-1].words else None
         elif key in _LISTS:
