@@ -189,14 +189,14 @@ def linear_spots_over_field(
     Raises:
         InputError: no light of a field passes.
     """
-    fields = fields_all_around(where.fields.tolist(), where.field_weights.tolist())
-    counts = where.weights > 0.0
-    waves = where.wavelengths[counts].tolist()
-    spots = gaussian_quadrature(
-        lens, list(fields), waves, _RINGS, _ARMS, where.object_distance, symmetry=False
+    where = fields_all_around(where.that_count())
+    points, waves, distance = (
+        where.fields.tolist(),
+        where.wavelengths.tolist(),
+        where.object_distance,
     )
-    of_fields = where.weights.new_tensor(list(fields.values()))
-    weights = spot_weights(torch.outer(of_fields, where.weights[counts]).flatten(), spots.count)
+    spots = gaussian_quadrature(lens, points, waves, _RINGS, _ARMS, distance, symmetry=False)
+    weights = spot_weights(torch.outer(where.field_weights, where.weights).flatten(), spots.count)
     return linear_spots(lens, spots, names), weights
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dolens.analysis.conditions import Conditions
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.elements import Element
 from dolens.optics.fabrication_errors import fabrication_errors, names_fabrication_errors
@@ -259,24 +260,19 @@ def usual_tolerances_text(lens: Lens) -> str:
     )
 
 
-def fields_all_around(
-    fields: Sequence[Sequence[float]], weights: Sequence[float]
-) -> dict[tuple[float, float], float]:
-    """Return fields on all four sides of the axis, with their weights: a perturbed lens has no
-    symmetry.
+def fields_all_around(where: Conditions) -> Conditions:
+    """Return conditions at fields on all four sides of the axis: a perturbed lens has no symmetry.
 
     Each of the given fields hands its weight on in equal parts: the axis to one, others to four.
-
-    Args:
-        fields: (x, y) of each, degrees or mm.
-        weights: of each.
     """
     found: dict[tuple[float, float], float] = {}
-    for (x, y), weight in zip(fields, weights, strict=True):
+    for (x, y), weight in zip(where.fields.tolist(), where.field_weights.tolist(), strict=True):
         for point in ((x, y), (-x, -y), (y, -x), (-y, x)):
             there = (point[0] + 0.0, point[1] + 0.0)
             found[there] = found.get(there, 0.0) + 0.25 * weight
-    return {point: weight for point, weight in found.items() if weight > 0.0}
+    counting = {point: weight for point, weight in found.items() if weight > 0.0}
+    weights = where.weights.new_tensor(list(counting.values()))
+    return replace(where.at(list(counting)), field_weights=weights)
 
 
 def _length(lens: Lens) -> float:
