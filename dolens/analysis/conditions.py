@@ -100,6 +100,37 @@ def _alike(values: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class AtConditions:
+    """The numbers of an analysis know at which F fields and W wavelengths they hold.
+
+    Attributes:
+        where: those, with weights, and the object distance.
+    """
+
+    where: Conditions
+
+    @property
+    def fields(self) -> Tensor:
+        """Return the fields (F, 2), degrees or mm."""
+        return self.where.fields
+
+    @property
+    def field_unit(self) -> str:
+        """Return `°` for an object at infinity, else `mm`."""
+        return self.where.field_unit
+
+    @property
+    def wavelengths(self) -> Tensor:
+        """Return the wavelengths (W,), nm."""
+        return self.where.wavelengths
+
+    @property
+    def reference_wavelength(self) -> float:
+        """Return the reference wavelength, nm."""
+        return self.where.reference_wavelength
+
+
+@dataclass(frozen=True)
 class FieldScan:
     """A scan runs through F field points on a line.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, moments, working_f_numbers
@@ -16,22 +16,16 @@ from dolens.optics.lens import Lens
 
 
 @dataclass(frozen=True)
-class EncircledEnergy:
-    """Encircled energy of F fields at Q radii, of all wavelengths together; float64 on the CPU.
+class EncircledEnergy(AtConditions):
+    """Encircled energy of F fields at Q radii, of all wavelengths that count; float64 on the CPU.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm, those that count.
         radii_um: (Q,), µm from the centroid of the polychromatic light.
         energy: (F, Q), from 0 to 1, share of the light that passes the lens; NaN where none does.
         airy_radius_um: µm, 1.22·λ·N at the wavelengths' mean, with the paraxial working F-number.
         diffraction: whether diffraction is part of it, or only rays, of each field.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     radii_um: Tensor
     energy: Tensor
     airy_radius_um: float
@@ -100,9 +94,7 @@ def encircled_energy(
         within = torch.cat([share.new_zeros(1), share[lit][order].cumsum(0)])
         curves.append(within[inside] / within[-1])
     return EncircledEnergy(
-        where.fields,
-        where.field_unit,
-        where.wavelengths,
+        where,
         radii,
         torch.stack(curves),
         float(where.weights @ airy),

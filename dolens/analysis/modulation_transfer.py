@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
@@ -29,14 +29,11 @@ _TINY = 1e-30
 
 
 @dataclass(frozen=True)
-class Modulation:
+class Modulation(AtConditions):
     """A `Modulation` holds the polychromatic geometric MTF of F fields at Q frequencies, in double
     precision on the CPU.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm, those that count.
         frequencies: (Q,), cycles/mm on the sensor.
         tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
             the y-z plane and on the axis; NaN where no light passes.
@@ -44,9 +41,6 @@ class Modulation:
         diffraction_limit: (Q,), of the paraxial circular pupil, the mean over the wavelengths.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     frequencies: Tensor
     tangential: Tensor
     sagittal: Tensor
@@ -154,9 +148,7 @@ def modulation(
     waves, numbers = where.wavelengths, working_f_numbers(lens, where)
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(
-        where.fields,
-        where.field_unit,
-        waves,
+        where,
         frequency,
         tangential,
         sagittal,

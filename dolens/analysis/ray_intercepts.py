@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import circle_points
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_line, launch
@@ -146,25 +146,17 @@ def _along_surface(
 
 
 @dataclass(frozen=True)
-class RayFans:
+class RayFans(AtConditions):
     """A `RayFans` holds transverse ray aberrations of F fields and W wavelengths at P points of the
     stop.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
-        reference_wavelength: nm, of the chief rays.
         coordinate: (P,), from -1 to 1, over the stop's semi-diameter.
         tangential_um: (F, W, P), µm: y on the sensor, less the chief ray's of the reference
             wavelength, of rays through (0, coordinate); NaN where a ray does not pass.
         sagittal_um: (F, W, P), µm: the same in x, of rays through (coordinate, 0).
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
-    reference_wavelength: float
     coordinate: Tensor
     tangential_um: Tensor
     sagittal_um: Tensor
@@ -192,10 +184,7 @@ def ray_fans(lens: Lens, where: Conditions, count: int = 41) -> RayFans:
     intercepts = trace_ray_intercepts(lens, where, pupil, exact=True)
     deviation = 1e3 * (intercepts.points - intercepts.chief[:, None, None])
     return RayFans(
-        fields=where.fields,
-        field_unit=where.field_unit,
-        wavelengths=where.wavelengths,
-        reference_wavelength=where.reference_wavelength,
+        where=where,
         coordinate=coordinate,
         tangential_um=deviation[..., :count, 1],
         sagittal_um=deviation[..., count:, 0],

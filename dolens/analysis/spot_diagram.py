@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.errors import InputError
@@ -22,21 +22,16 @@ AIRY = 1.2196698912665045
 
 
 @dataclass(frozen=True)
-class SpotDiagram:
+class SpotDiagram(AtConditions):
     """A `SpotDiagram` holds spots of F fields and W wavelengths by N points of the stop, in double
     precision on the CPU.
 
     Values of fields or wavelengths that no light reaches are NaN.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
-        reference_wavelength: nm, of the chief rays.
         intercepts: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
         valid: (F, W, N), bool.
         weight: (N,), share of a ray in the light through the stop; zero for rays on its rim.
-        wavelength_weight: (W,), shares of the wavelengths in polychromatic values.
         chief: (F, 2), mm, intercept of the chief ray of the reference wavelength.
         centroid: (F, W, 2), mm.
         rms: (F, W), mm, √(Σ w·|p - p̄|²) about the spot's own centroid.
@@ -47,14 +42,9 @@ class SpotDiagram:
         airy_radius: (W,), mm, 1.22·λ·N with the paraxial working F-number of the stop.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
-    reference_wavelength: float
     intercepts: Tensor
     valid: Tensor
     weight: Tensor
-    wavelength_weight: Tensor
     chief: Tensor
     centroid: Tensor
     rms: Tensor
@@ -89,14 +79,10 @@ def spot_diagram(lens: Lens, where: Conditions, rays: int = 2000) -> SpotDiagram
     every = (light * where.weights[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
     return SpotDiagram(
-        fields=where.fields,
-        field_unit=where.field_unit,
-        wavelengths=where.wavelengths,
-        reference_wavelength=where.reference_wavelength,
+        where=where,
         intercepts=points,
         valid=valid,
         weight=weight,
-        wavelength_weight=where.weights,
         chief=intercepts.chief,
         centroid=centroid,
         rms=mean_square.sqrt(),
@@ -135,21 +121,15 @@ def working_f_numbers(lens: Lens, where: Conditions) -> Tensor:
 
 
 @dataclass(frozen=True)
-class RMSCurves:
+class RMSCurves(AtConditions):
     """An `RMSCurves` holds RMS spot radii of F fields and W wavelengths; NaN where no light passes.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         rms: (F, W), mm, about each spot's own centroid.
         polychromatic: (F,), mm, of all wavelengths together about their common centroid.
         airy_radius: (W,), mm.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     rms: Tensor
     polychromatic: Tensor
     airy_radius: Tensor
@@ -214,11 +194,4 @@ def rms_against_wavelength(
 
 def _curves(lens: Lens, where: Conditions, rays: int) -> RMSCurves:
     spots = spot_diagram(lens, where, rays)
-    return RMSCurves(
-        spots.fields,
-        spots.field_unit,
-        spots.wavelengths,
-        spots.rms,
-        spots.polychromatic_rms,
-        spots.airy_radius,
-    )
+    return RMSCurves(where, spots.rms, spots.polychromatic_rms, spots.airy_radius)

@@ -145,7 +145,7 @@ def lens_summary(lens: Lens, given: Conditions) -> LensSummary:
     exact = in_double_precision(lens)
     spots = spot_diagram(exact, given, _RAYS)
     sums = seidel_sums(exact, given)
-    geo = spots.geo[:, spots.wavelength_weight > 0.0].nan_to_num(-math.inf).amax(-1)
+    geo = spots.geo[:, spots.where.weights > 0.0].nan_to_num(-math.inf).amax(-1)
     first = first_order_numbers(exact, given)
     return LensSummary(
         **vars(first),

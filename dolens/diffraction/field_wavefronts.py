@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.fields_and_wavelengths import field_unit
 from dolens.diffraction.entrance_beam import EntranceBeam, ObjectPoints, find_beam
 from dolens.diffraction.field_pupil import FieldPupil
@@ -21,20 +21,18 @@ _COARSE = 16
 
 
 @dataclass(frozen=True)
-class FieldWavefronts:
+class FieldWavefronts(AtConditions):
     """Wavefronts of F fields and W wavelengths; no gradient.
 
     All wavelengths of a field have one reference point on the sensor, so that lateral colour shows
     as a tilt.
 
     Attributes:
-        where: fields, wavelengths with their weights, and object distance.
         centre: (F, 2), mm on the sensor: the centroid of the polychromatic light.
         wavefront: F·W wavefronts to spheres about `centre`, wavelengths of a field together.
         lit: (F, W), bool: light passes.
     """
 
-    where: Conditions
     centre: Tensor
     wavefront: Wavefront
     lit: Tensor

@@ -265,9 +265,7 @@ def huygens_modulation(
     tangential, sagittal = torch.stack(curves, 1)
     limit = unknown.expand(len(where.fields), -1)
     return DiffractionModulation(
-        where.fields,
-        where.field_unit,
-        found.wavelengths,
+        where.that_count(),
         frequency,
         tangential,
         sagittal,

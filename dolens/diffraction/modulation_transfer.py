@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.modulation_transfer import field_directions
 from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
@@ -18,13 +18,10 @@ _MOST_SAMPLES = 1024
 
 
 @dataclass(frozen=True)
-class DiffractionModulation:
+class DiffractionModulation(AtConditions):
     """MTF with diffraction of F fields at Q frequencies, of all wavelengths; float64 on the CPU.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm on the sensor.
         tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
             the y-z plane and on the axis; NaN where no light passes.
@@ -39,9 +36,6 @@ class DiffractionModulation:
             light passes.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     frequencies: Tensor
     tangential: Tensor
     sagittal: Tensor
@@ -89,9 +83,7 @@ def diffraction_modulation(
         errors.append(float((found_here.abs() - coarser.abs()).abs().amax()))
     tangential, sagittal, *limits = torch.stack(rows, 1).cpu()
     return DiffractionModulation(
-        found.where.fields,
-        found.where.field_unit,
-        found.where.wavelengths,
+        found.where,
         frequency.cpu(),
         tangential,
         sagittal,

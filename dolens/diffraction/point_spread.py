@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
@@ -25,13 +25,10 @@ _CELLS = 128
 
 
 @dataclass(frozen=True)
-class PointSpread:
+class PointSpread(AtConditions):
     """Point spread functions of F fields, of all wavelengths together; float64 on the CPU.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         centre: (F, 2), mm on the sensor, of the windows: the centroids of the light.
         half_width_um: (F,), µm, from the centre to the sides of the window.
         irradiance: (F, M, M), share of the light per µm², the mean over a cell of the window; rows
@@ -46,9 +43,6 @@ class PointSpread:
             computation with a coarser pupil (see `point_spread`); NaN where rays alone are used.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     centre: Tensor
     half_width_um: Tensor
     irradiance: Tensor
@@ -93,9 +87,7 @@ def of_all_fields(
         return torch.tensor(list(values), dtype=torch.float64)
 
     return PointSpread(
-        found.where.fields,
-        found.where.field_unit,
-        found.where.wavelengths,
+        found.where,
         found.centre,
         numbers(row.half_width_um for row in rows),
         torch.stack([row.irradiance.cpu() for row in rows]),
@@ -187,9 +179,7 @@ def diffraction_encircled_energy(
         for pupil in pupils
     ]
     return EncircledEnergy(
-        found.where.fields,
-        found.where.field_unit,
-        found.where.wavelengths,
+        found.where,
         radii,
         torch.stack(curves).cpu(),
         airy,
@@ -276,13 +266,10 @@ _PEAK_CELLS = 64
 
 
 @dataclass(frozen=True)
-class StrehlRatios:
+class StrehlRatios(AtConditions):
     """Strehl ratios of F fields at W wavelengths, each alone, on the sensor as it stands.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         peak: (F, W), highest irradiance of the point spread function over that of the same pupil
             without aberrations (Strehl); NaN where no light passes, or where the wavefront is too
             steep for diffraction.
@@ -291,9 +278,6 @@ class StrehlRatios:
         sampling_error: (F, W), of the point spread function; see `point_spread`.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     peak: Tensor
     marechal: Tensor
     sampling_error: Tensor
@@ -317,9 +301,7 @@ def strehl_ratios(lens: Lens, where: Conditions) -> StrehlRatios:
         peak.append(found.strehl_ratio)
         sampling.append(found.sampling_error)
     return StrehlRatios(
-        where.fields,
-        where.field_unit,
-        where.wavelengths,
+        where,
         torch.stack(peak, -1),
         marechal(errors.rms),
         torch.stack(sampling, -1),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions
+from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.zernike_fit import TERMS, ZernikeFit, zernike_fit
 from dolens.diffraction.entrance_beam import (
     EntranceBeam,
@@ -25,7 +25,7 @@ from dolens.optics.system import OpticalSystem
 
 
 @dataclass(frozen=True)
-class WavefrontMaps:
+class WavefrontMaps(AtConditions):
     """Wavefront errors of F fields and W wavelengths at S × S rays each; float64 on the CPU.
 
     The wavefront error W is measured on a sphere about the point of the sensor where the chief ray
@@ -35,9 +35,6 @@ class WavefrontMaps:
     of a simple positive lens has W₀₄₀ > 0 at its paraxial focus.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         stop: (F, W, S, S, 2), where the rays cross the stop, over its semi-diameter, in its axes;
             the same numbers as the `pupil` of `Lens.aim`.
         error: (F, W, S, S), waves, with a mean of zero over the light; NaN where none passes.
@@ -48,9 +45,6 @@ class WavefrontMaps:
             does not arrive, about the centroid of the light.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     stop: Tensor
     error: Tensor
     weight: Tensor
@@ -120,9 +114,7 @@ def wavefront_maps(lens: Lens, where: Conditions, samples: int = 64) -> Wavefron
         return values.cpu().unflatten(0, shape)
 
     return WavefrontMaps(
-        where.fields,
-        where.field_unit,
-        where.wavelengths,
+        where,
         found(stop),
         found(error.where(weight > 0.0, torch.nan)),
         found(weight),
@@ -148,21 +140,15 @@ def _stop_coordinates(
 
 
 @dataclass(frozen=True)
-class WavefrontErrors:
+class WavefrontErrors(AtConditions):
     """Wavefront errors of F fields and W wavelengths; NaN where no light passes.
 
     Attributes:
-        fields: (F, 2), degrees or mm.
-        field_unit: `°` for an object at infinity, else `mm`.
-        wavelengths: (W,), nm.
         rms: (F, W), waves, about the best tilt and piston, focus left as it is on the sensor.
         peak_to_valley: (F, W), waves, over the rays that pass, about the same.
         strehl_ratio: (F, W), irradiance where that tilt points over that of a perfect wavefront.
     """
 
-    fields: Tensor
-    field_unit: str
-    wavelengths: Tensor
     rms: Tensor
     peak_to_valley: Tensor
     strehl_ratio: Tensor
@@ -202,9 +188,7 @@ def wavefront_errors(lens: Lens, where: Conditions, samples: int = 64) -> Wavefr
         return of.cpu().unflatten(0, shape).where(found.lit, torch.nan)
 
     return WavefrontErrors(
-        where.fields,
-        where.field_unit,
-        where.wavelengths,
+        where,
         values((share * error.square()).sum(1).sqrt()),
         values((high - low).clamp(min=0.0)),
         values(real.square() + imaginary.square()),

@@ -235,7 +235,7 @@ def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
     caption = "RMS radii in µm about the centroid of each spot"
     if many:
         caption += "; polychromatic: about that of all wavelengths together"
-        caption += f"{weights_text(spots.wavelength_weight)}"
+        caption += f"{weights_text(spots.where.weights)}"
     caption += "."
     if bool(spots.rms.isnan().any()):
         caption += "  – : no light passes."

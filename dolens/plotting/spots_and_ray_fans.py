@@ -187,7 +187,7 @@ class _Drawn:
         """
         if wave is None:
             rms = float(self.spots.polychromatic_rms[field])
-            counts = (self.spots.wavelength_weight > 0.0).numpy()
+            counts = (self.spots.where.weights > 0.0).numpy()
             far = _largest(np.linalg.norm(self.points[field, counts], axis=-1))
         else:
             rms = float(self.spots.rms[field, wave])

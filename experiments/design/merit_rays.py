@@ -65,14 +65,10 @@ def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
     places = where.fields.to(dtype=lens.dtype, device=lens.device)
     chief = lens.chief_ray(places, where.reference_wavelength)
     return SpotDiagram(
-        fields=where.fields,
-        field_unit=where.field_unit,
-        wavelengths=where.wavelengths,
-        reference_wavelength=where.reference_wavelength,
+        where=where,
         intercepts=points,
         valid=valid,
         weight=torch.full((points.shape[2],), 1.0 / points.shape[2], dtype=torch.float64),
-        wavelength_weight=where.weights,
         chief=lens.trace(chief).position[..., :2].double().cpu(),
         centroid=moments(points, light)[0],
         rms=rms,
@@ -117,9 +113,7 @@ def merit_modulation(
     by_rays = [not done for done in whole.diffraction]
     factor = torch.where(torch.tensor(by_rays)[:, None], limit, 1.0)
     found = Modulation(
-        whole.fields,
-        whole.field_unit,
-        whole.wavelengths,
+        whole.where,
         whole.frequencies,
         whole.tangential * factor,
         whole.sagittal * factor,
@@ -155,9 +149,7 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
     numbers = pupil_f_numbers(lens, settings, where)
     limit = where.weights @ _square_limits(numbers, where.wavelengths, frequencies)
     return Modulation(
-        where.fields,
-        where.field_unit,
-        where.wavelengths,
+        where,
         frequencies,
         tangential * limit,
         sagittal * limit,
@@ -203,9 +195,7 @@ def _curves(lens: Lens, settings: MeritSettings, where: Conditions) -> RMSCurves
         rows = [_radii_or_none(lens, own, field) for field in fields]
         rms, together = (torch.cat(part) for part in zip(*rows, strict=True))
     return RMSCurves(
-        fields=where.fields,
-        field_unit=where.field_unit,
-        wavelengths=where.wavelengths,
+        where=where,
         rms=rms,
         polychromatic=together,
         airy_radius=_airy_radii(lens, settings, where),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dolens import load_lens
-from dolens.analysis.conditions import field_scans
+from dolens.analysis.conditions import conditions, field_scans
 from dolens.analysis.field_curves import field_curves
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.spot_diagram import RMSCurves
@@ -75,9 +75,10 @@ def test_illumination_is_in_percent_of_the_axis(triplet):
 FIELDS = torch.tensor([[0.0, 0.0], [0.0, 14.0], [3.0, 4.0]], dtype=torch.float64)
 
 
-def test_rms_curves_are_in_micrometres_over_degrees_and_nanometres():
+def test_rms_curves_are_in_micrometres_over_degrees_and_nanometres(triplet):
     rms = torch.tensor([[1.0, 2.0], [3.0, math.nan], [5.0, 6.0]], dtype=torch.float64) * 1e-3
-    curves = RMSCurves(FIELDS, "°", WAVES, rms, rms[:, 0], torch.tensor([2e-3, 8e-3]))
+    where = conditions(triplet, FIELDS, WAVES)
+    curves = RMSCurves(where, rms, rms[:, 0], torch.tensor([2e-3, 8e-3]))
     left, right = rms_curves_figure(curves, curves, "RMS").axes
     lines = {line.get_label(): line for line in left.get_lines()}
     np.testing.assert_allclose(lines["656.273 nm"].get_data(), [[0, 14, 5], [1, 3, 5]])
@@ -95,11 +96,12 @@ def test_rms_curves_are_in_micrometres_over_degrees_and_nanometres():
         rms_curves_figure()
 
 
-def test_fields_on_both_sides_of_the_axis_are_plotted_on_both_sides():
+def test_fields_on_both_sides_of_the_axis_are_plotted_on_both_sides(triplet):
     """A lens that is tilted in y blurs fields above the axis unlike those below."""
     fields = torch.tensor([[0.0, -2.0], [0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)
     rms = torch.tensor([[3.0], [1.0], [2.0]], dtype=torch.float64) * 1e-3
-    curves = RMSCurves(fields, "°", WAVES[:1], rms, rms[:, 0], torch.tensor([2e-3]))
+    where = conditions(triplet, fields, WAVES[:1])
+    curves = RMSCurves(where, rms, rms[:, 0], torch.tensor([2e-3]))
     (axes,) = rms_curves_figure(curves).axes
     np.testing.assert_allclose(axes.get_lines()[0].get_data(), [[-2, 0, 2], [3, 1, 2]])
     assert axes.get_xlabel() == "field along y (°)" and axes.get_xlim() == (-2.0, 2.0)

@@ -17,11 +17,12 @@ LINES = torch.tensor([656.2725, 486.1327], dtype=torch.float64)
 FIELDS = torch.tensor([[0.0, 0.0], [0.0, 14.0], [3.0, 4.0]], dtype=torch.float64)
 
 
-def test_modulation_is_drawn_below_its_limit():
+def test_modulation_is_drawn_below_its_limit(triplet):
     frequency = torch.linspace(0.0, 50.0, 6).double()
     curves = torch.linspace(1.0, 0.5, 6).double() * torch.tensor([[1.0], [0.8], [math.nan]])
     limit = torch.linspace(1.0, 0.9, 6)
-    mtf = Modulation(FIELDS, "°", LINES, frequency, curves, 0.9 * curves, limit)
+    where = conditions(triplet, FIELDS, LINES)
+    mtf = Modulation(where, frequency, curves, 0.9 * curves, limit)
     figure = modulation_figure(mtf)
     axes = figure.axes[0]
     lines = {line.get_label(): line for line in axes.get_lines()}
@@ -52,13 +53,14 @@ def test_fields_on_both_sides_of_a_lens_share_their_entry_and_have_a_minus(tripl
     assert not flaws(figure)
 
 
-def test_each_field_has_one_entry_where_panels_join_other_fields():
+def test_each_field_has_one_entry_where_panels_join_other_fields(triplet):
     frequency = torch.linspace(0.0, 50.0, 6).double()
     curve, limit = torch.linspace(1.0, 0.5, 6).double(), torch.linspace(1.0, 0.9, 6)
+    where = conditions(triplet, FIELDS[:2], LINES)
 
     def panel(scales):
         curves = curve * torch.tensor(scales).double()[:, None]
-        return Modulation(FIELDS[:2], "°", LINES, frequency, curves, curves, limit)
+        return Modulation(where, frequency, curves, curves, limit)
 
     panels = {"apart": panel([1.0, 0.8]), "alike": panel([1.0, 1.0])}
     figure = modulation_figure(panels, labels=["0°", "14° (rays alone)"])

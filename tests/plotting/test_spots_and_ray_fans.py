@@ -79,12 +79,12 @@ def test_overlaid_spots_have_a_panel_a_field(spots):
     assert figure.axes[1].get_title().partition("\n")[2].startswith(f"RMS {rms:.3g},")
 
 
-def test_five_overlaid_fields_wrap():
+def test_five_overlaid_fields_wrap(triplet):
     shape = (5, 1, 4)
     blank = torch.zeros(*shape[:2], dtype=torch.float64)
     many = SpotDiagram(
-        torch.arange(10.0).reshape(5, 2), "mm", LINES[:1], 587.6, torch.zeros(*shape, 2),
-        torch.ones(shape, dtype=torch.bool), torch.ones(4) / 4, torch.ones(1),
+        conditions(triplet, torch.arange(10.0).reshape(5, 2), LINES[:1], 500.0),
+        torch.zeros(*shape, 2), torch.ones(shape, dtype=torch.bool), torch.ones(4) / 4,
         torch.zeros(5, 2), torch.zeros(5, 1, 2), blank, blank, torch.zeros(5, 2), blank[:, 0],
         torch.tensor([2e-3]),
     )  # fmt: skip
@@ -95,13 +95,14 @@ def test_five_overlaid_fields_wrap():
     assert len(shown) == 5 and shown[4].get_subplotspec().rowspan.start == 1
 
 
-def test_ray_fans_share_one_scale_and_leave_out_what_does_not_pass():
+def test_ray_fans_share_one_scale_and_leave_out_what_does_not_pass(triplet):
     coordinate = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
     tangential = coordinate.expand(3, 2, 5) * torch.tensor([1.0, 2.0]).double()[:, None]
     tangential = tangential.clone()
     tangential[1, :, 0] = math.nan
     tangential[2] = math.nan
-    fans = RayFans(FIELDS, "°", LINES, 587.6, coordinate, tangential, 3.0 * tangential)
+    where = conditions(triplet, FIELDS, LINES)
+    fans = RayFans(where, coordinate, tangential, 3.0 * tangential)
     figure = ray_fans_figure(fans)
     grid = np.reshape(figure.axes, (3, 2))
     assert grid[0, 0].get_title() == "tangential: y" and grid[0, 1].get_title() == "sagittal: x"
