@@ -1,8 +1,14 @@
 """The best forms of a search get catalogue glasses.
 
 The glasses of a form become continuous and are optimised with the lens, as `finish` does it, until
-operands hold.  Then they are snapped and exchanged (see `snapping`), and the lenses that come of it
-are finished with their glasses held.
+operands hold.  Then they become catalogue glasses, one by one, in the order that costs least: at
+each step every free glass is tried as each of the real glasses next to it, and the lens is
+optimised again with that one held; of all these trials the best few are kept (a beam), so that the
+glass which costs least is fixed first and those left can make up for it.  All trials of a step, of
+all lenses, are one batch for `reoptimiser`.  When all are fixed, glasses are exchanged, one at a
+time and then two, while that helps: for the real glasses next to one, and for those next to what
+it becomes when it is set free and the lens is optimised with it.  The lenses that come of it are
+finished with their glasses held.
 
 How much a lens expects of other glasses is a quadratic model from its residuals' Jacobian.  With
 residuals r and the Jacobian J with respect to everything, variables and coordinates of all
@@ -11,7 +17,9 @@ that is free is the one that makes this smallest (a Schur complement), and what 
 2 b·δ + δ·H δ.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -20,13 +28,19 @@ from dolens.errors import InputError
 from dolens.lens_search.designs import Designs
 from dolens.lens_search.glass.glass_family import FREE
 from dolens.lens_search.glass.glass_merit import GlassMerit
-from dolens.lens_search.glass.snapping import snap_glasses
 from dolens.lens_search.glass.trial_glasses import (
     GlassModel,
     GlassTrials,
+    JudgedTrials,
     Reoptimise,
     Reoptimised,
     SnapSettings,
+    TrialGlasses,
+    best_of_each_lens,
+    joined,
+    joined_trials,
+    keys,
+    unseen,
 )
 from dolens.lens_search.growth import Grown, finish, settled
 from dolens.lens_search.search_rays import Conditions
@@ -101,8 +115,7 @@ def with_real_glasses(
     choice = merit.specification.glass_choice
     if choice is not None and choice.costs:
         cost = optimise(start).merit[0] * merit.glasses.costs(choice.costs)
-    found = snap_glasses(start, merit.glasses.coordinates, optimise, plan.snapping, cost)
-    trials = found.several.trials
+    trials = snap_glasses(start, merit.glasses.coordinates, optimise, plan.snapping, cost).trials
     u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)
     held = merit.held()
     none = torch.zeros(len(u), dtype=torch.float64)
@@ -239,3 +252,131 @@ def _eliminated(
     solved = torch.linalg.solve(among, right)
     change = across.transpose(1, 2) @ solved
     return gradient[:, own] - change[..., -1], gram[:, own][:, :, own] - change[..., :-1]
+
+
+def snap_glasses(
+    start: GlassTrials,
+    glasses: Tensor,
+    reoptimise: Reoptimise,
+    settings: SnapSettings | None = None,
+    cost: Tensor | None = None,
+) -> JudgedTrials:
+    """Return lenses with catalogue glasses in place of their continuous ones.
+
+    Args:
+        start: L lenses, different in their numbers; glasses whose number is not -1 are held
+            throughout.
+        glasses: (K, C), the coordinates of the real glasses.
+        reoptimise: optimises a batch of trials, each from where it stands.
+        settings: how many trials are made.
+        cost: (K,), added to the merit for each glass of a lens; a free glass counts as the nearest.
+
+    Returns:
+        The best few of each lens, different in their glasses, the best first.  A lens whose every
+        trial failed is not among them.
+
+    Raises:
+        InputError: there are no glasses, or two lenses have one number.
+    """
+    if glasses.ndim != 2 or len(glasses) == 0:
+        raise InputError("snapping: there is no glass to choose from")
+    if len(start.lens.unique()) < len(start.lens):
+        raise InputError("snapping: two lenses have the same number")
+    work = TrialGlasses(glasses, reoptimise, settings or SnapSettings(), cost)
+    designs = best_of_each_lens(work.optimised(start), 1)
+    far = work.optimised(unseen(work.far_glasses(designs), set()))
+    while bool((designs.trials.numbers < 0).any()):
+        free = (designs.trials.numbers < 0).any(1)
+        tried = work.optimised(unseen(work.one_more_fixed(designs.take(free)), set()))
+        designs = best_of_each_lens(joined([designs.take(~free), far, tried]), work.settings.beam)
+        far = far.take(far.trials.lens[:0])
+    held = {
+        lens: row.tolist()
+        for lens, row in zip(start.lens.tolist(), start.numbers >= 0, strict=True)
+    }
+    return exchanged(work, designs, held)
+
+
+def exchanged(
+    work: TrialGlasses, designs: JudgedTrials, held: Mapping[int, Sequence[bool]]
+) -> JudgedTrials:
+    """Return the designs after exchanges, the best few of each lens.
+
+    A round exchanges single glasses of every design; where that does not help a lens, pairs of
+    glasses of its best design.  A lens that neither helps is finished.
+
+    Args:
+        work: makes the trials.
+        designs: with real glasses everywhere.
+        held: number of a lens → which of its glasses are not exchanged.
+    """
+    settings = work.settings
+    seen = set(keys(designs.trials))
+    finished: list[JudgedTrials] = []
+    for _ in range(settings.rounds):
+        if len(designs.total) == 0:
+            break
+        after = _moved(work, designs, held, 1, seen)
+        stuck = ~_is_better(after, designs, settings.least_gain)
+        if settings.pair_neighbours and bool(stuck.any()):
+            pairs = _moved(work, best_of_each_lens(after.take(stuck), 1), held, 2, seen)
+            after = best_of_each_lens(joined([after, pairs]), settings.beam)
+        going = _is_better(after, designs, settings.least_gain)
+        finished.append(after.take(~going))
+        designs = after.take(going)
+    return best_of_each_lens(joined([*finished, designs]), settings.beam)
+
+
+def _moved(
+    work: TrialGlasses,
+    designs: JudgedTrials,
+    held: Mapping[int, Sequence[bool]],
+    together: int,
+    seen: set[tuple[int, ...]],
+) -> JudgedTrials:
+    """Return the best designs after so many glasses at a time were exchanged, and before."""
+    rows, slots = _places(designs.trials, held, together)
+    if len(rows) == 0:
+        return designs
+    count = work.settings.neighbours if together == 1 else work.settings.pair_neighbours
+    start = designs.take(rows)
+    before = start.trials
+    freed = unseen(before._replace(numbers=before.numbers.scatter(1, slots, -1)), seen)
+    seen.update(keys(freed))
+    free = work.optimised(freed)
+    free_slots = (free.trials.numbers < 0).nonzero()[:, 1].reshape(-1, together)
+    near = [work.replaced(start, slots, count), work.replaced(free, free_slots, count)]
+    trials = unseen(joined_trials(near), seen)
+    seen.update(keys(trials))
+    return best_of_each_lens(joined([designs, work.optimised(trials)]), work.settings.beam)
+
+
+def _places(
+    trials: GlassTrials, held: Mapping[int, Sequence[bool]], together: int
+) -> tuple[Tensor, Tensor]:
+    """Return each way to take so many glasses of a trial: its row, (M,), and places, (M, P)."""
+    rows, slots = [], []
+    for row, lens in enumerate(trials.lens.tolist()):
+        places = [place for place, is_held in enumerate(held[lens]) if not is_held]
+        for chosen in combinations(places, together):
+            rows.append(row)
+            slots.append(chosen)
+    device = trials.numbers.device
+    return (
+        torch.tensor(rows, dtype=torch.long, device=device),
+        torch.tensor(slots, dtype=torch.long, device=device).reshape(-1, together),
+    )
+
+
+def _is_better(after: JudgedTrials, before: JudgedTrials, least_gain: float) -> Tensor:
+    """Return, for each design, whether the best of its lens is better than it was before."""
+    best: list[dict[int, float]] = []
+    for designs in (after, before):
+        totals: dict[int, float] = {}
+        for lens, total in zip(designs.trials.lens.tolist(), designs.total.tolist(), strict=True):
+            totals[lens] = min(total, totals.get(lens, total))
+        best.append(totals)
+    now, then = best
+    better = {lens: now[lens] < then[lens] - least_gain * abs(then[lens]) for lens in now}
+    lenses = after.trials.lens.tolist()
+    return torch.tensor([better[lens] for lens in lenses], dtype=torch.bool).to(after.total.device)

@@ -63,7 +63,7 @@ Reoptimise = Callable[[GlassTrials], Reoptimised]
 
 
 @dataclass(frozen=True)
-class Designs:
+class JudgedTrials:
     """Trials with their merits.
 
     Attributes:
@@ -81,10 +81,10 @@ class Designs:
     expected: Tensor
     model: GlassModel | None = None
 
-    def take(self, chosen: Tensor) -> "Designs":
+    def take(self, chosen: Tensor) -> "JudgedTrials":
         """Return some of the designs, or some of them several times."""
         model = self.model and GlassModel(*(part[chosen] for part in self.model))
-        return Designs(
+        return JudgedTrials(
             take(self.trials, chosen),
             self.merit[chosen],
             self.total[chosen],
@@ -103,11 +103,11 @@ def joined_trials(several: Sequence[GlassTrials]) -> GlassTrials:
     return GlassTrials(*(torch.cat(parts) for parts in zip(*several, strict=True)))
 
 
-def joined(several: Sequence[Designs]) -> Designs:
+def joined(several: Sequence[JudgedTrials]) -> JudgedTrials:
     """Return all designs of several batches."""
     parts = [designs for designs in several if len(designs.merit)] or several[:1]
     models = [designs.model for designs in parts if designs.model]
-    return Designs(
+    return JudgedTrials(
         joined_trials([designs.trials for designs in parts]),
         torch.cat([designs.merit for designs in parts]),
         torch.cat([designs.total for designs in parts]),
@@ -116,7 +116,7 @@ def joined(several: Sequence[Designs]) -> Designs:
     )
 
 
-def best_of_each_lens(designs: Designs, count: int) -> Designs:
+def best_of_each_lens(designs: JudgedTrials, count: int) -> JudgedTrials:
     """Return at most that many designs of each lens, different in their glasses, best first.
 
     The best are those that are expected to be it when all glasses are real.
@@ -200,17 +200,17 @@ class TrialGlasses:
         settings: SnapSettings,
         cost: Tensor | None = None,
     ) -> None:
-        """See `dolens.lens_search.glass.snapping.snap_glasses` for what is given."""
+        """See `dolens.lens_search.glass.glass_step.snap_glasses` for what is given."""
         self._glasses = glasses
         self._reoptimise = reoptimise
         self.settings = settings
         self._cost = torch.zeros_like(glasses[:, 0]) if cost is None else cost.to(glasses)
 
-    def optimised(self, trials: GlassTrials) -> Designs:
+    def optimised(self, trials: GlassTrials) -> JudgedTrials:
         """Return the trials after optimisation, without those that failed."""
         if len(trials.lens) == 0:
             nothing = trials.variables.new_zeros(0)
-            return Designs(trials, nothing, nothing, nothing)
+            return JudgedTrials(trials, nothing, nothing, nothing)
         merit, variables, coordinates, model = self._reoptimise(trials)
         held = trials.numbers >= 0
         coordinates = torch.where(held[..., None], trials.coordinates, coordinates)
@@ -224,7 +224,7 @@ class TrialGlasses:
         )
         risen = (merit**2 + (rise * ~held).sum(1)).clamp(min=0.0).sqrt()
         found = GlassTrials(trials.lens, variables, coordinates, trials.numbers)
-        designs = Designs(found, merit, merit + cost, risen + cost, model)
+        designs = JudgedTrials(found, merit, merit + cost, risen + cost, model)
         return designs.take(torch.isfinite(designs.total).nonzero()[:, 0])
 
     def _rises(self, points: Tensor, model: GlassModel | None) -> Tensor:
@@ -242,12 +242,12 @@ class TrialGlasses:
         rise = 2.0 * torch.einsum("tpkc,tpc->tpk", shift, model.slopes)
         return rise + torch.einsum("tpkc,tpcd,tpkd->tpk", shift, model.curvatures, shift)
 
-    def one_more_fixed(self, designs: Designs) -> GlassTrials:
+    def one_more_fixed(self, designs: JudgedTrials) -> GlassTrials:
         """Return, for each free glass of each design, those with a real glass in its place."""
         row, glass = (designs.trials.numbers < 0).nonzero(as_tuple=True)
         return self.replaced(designs.take(row), glass[:, None], self.settings.neighbours)
 
-    def far_glasses(self, designs: Designs) -> GlassTrials:
+    def far_glasses(self, designs: JudgedTrials) -> GlassTrials:
         """Return, for each free glass of each design, those with glasses from all over the set."""
         row, glass = (designs.trials.numbers < 0).nonzero(as_tuple=True)
         far = spread(self._glasses, self.settings.far)
@@ -258,7 +258,7 @@ class TrialGlasses:
             self._glasses,
         )
 
-    def replaced(self, designs: Designs, slots: Tensor, count: int) -> GlassTrials:
+    def replaced(self, designs: JudgedTrials, slots: Tensor, count: int) -> GlassTrials:
         """Return the designs with every combination of real glasses in some places.
 
         Args:
@@ -273,7 +273,7 @@ class TrialGlasses:
         chosen = candidates[rows].gather(2, pick.repeat(len(slots), 1)[..., None])[..., 0]
         return _with_glasses(take(designs.trials, rows), slots[rows], chosen, self._glasses)
 
-    def _candidates(self, designs: Designs, slots: Tensor, count: int) -> Tensor:
+    def _candidates(self, designs: JudgedTrials, slots: Tensor, count: int) -> Tensor:
         """Return the numbers (T, P, count) of the real glasses to try in some places.
 
         Half of them are the nearest, the others those of which the model expects most.

@@ -9,8 +9,7 @@ from dolens import InputError
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.glass.choice import GlassChoice, choose_glasses, glass_set
 from dolens.lens_search.glass.glass_merit import GlassMerit
-from dolens.lens_search.glass.glass_step import reoptimiser
-from dolens.lens_search.glass.snapping import snap_glasses
+from dolens.lens_search.glass.glass_step import reoptimiser, snap_glasses
 from dolens.lens_search.glass.trial_glasses import GlassTrials, SnapSettings
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.real_pupils import with_real_beams
@@ -109,14 +108,14 @@ def test_a_triplet_gains_from_free_glasses_and_keeps_it_with_real_ones(merit, le
     free = start._replace(numbers=torch.full_like(numbers[:1], -1))
     settings = SnapSettings(neighbours=3, far=0, beam=1, pair_neighbours=0, rounds=0)
     found = snap_glasses(free, merit.glasses.coordinates, optimise, settings)
-    assert (found.designs.trials.numbers >= 0).all()
-    assert found.designs.merit < 0.7 * before
+    assert (found.trials.numbers >= 0).all()
+    assert found.merit < 0.7 * before
     # What the callback says is the mean of the spots that the lens of these glasses has, and what
     # its operands lack.
-    trials = found.designs.trials
+    trials = found.trials
     u = merit.with_glasses(trials.variables, trials.coordinates, trials.numbers)
     mean = merit.spots(u, full).mean(1) / FOCAL
-    lacking = (found.designs.merit - mean) / mean
+    lacking = (found.merit - mean) / mean
     assert 0.0 <= lacking < 0.1
 
 
