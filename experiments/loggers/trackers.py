@@ -14,7 +14,6 @@ import yaml
 from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
-from torch.utils.tensorboard.summary import hparams
 
 from dolens.experiments.loggers.protocol import RunSummary, ends_alone, require_package
 from dolens.experiments.tables import write_table
@@ -46,6 +45,8 @@ class TensorBoard(TensorBoardLogger):
         finds such a list, it takes the first run's, and leaves out what other runs have besides.
         Without one it gathers the columns from all runs.
         """
+        from torch.utils.tensorboard.summary import hparams  # a run without TensorBoard needs none
+
         self.log_metrics(dict(summary.numbers), step=summary.step)
         settings = yaml.safe_dump(dict(summary.settings), sort_keys=False, allow_unicode=True)
         self.experiment.add_text("settings", f"```yaml\n{settings}```", summary.step)
