@@ -109,8 +109,6 @@ def _record(line: str, to_all: bool, with_traceback: bool = False) -> None:
 
 _TARGET = re.compile(r"call to target '(?P<name>[^']*)'")
 _KEY = re.compile(r"full_key: (?P<key>\S+)")
-# A part of a text, as `test/${score}`.
-_WITHIN = re.compile(r"\$\{([\w.]+)\}")
 _NAME = re.compile(r"[\w.]+")
 # A message begins with what it is about: a part's name and a setting's.
 _SUBJECT = 3
@@ -156,7 +154,8 @@ def _referred(plain: Mapping[str, Any], names: list[str]) -> Iterator[str]:
     """Yield the settings that arguments of these names are given by."""
     for name in names:
         value = plain.get(name)
-        yield from _WITHIN.findall(value) if isinstance(value, str) else ()
+        # A part of a text too, as `test/${score}`.
+        yield from REFERENCE.findall(value) if isinstance(value, str) else ()
     asked = {name.rpartition(".")[2] for name in names}
     for target in targets(plain, tuple(str(key) for key in plain)):
         for key in asked.intersection(target.keys):

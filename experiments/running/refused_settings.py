@@ -30,7 +30,7 @@ from dolens.experiments.settings import check_count, check_not_negative, check_p
 from dolens.typed_values import check_type, parameters_of
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
-# A value that is another part of the configuration as a whole, as `network: ${network}`.
+# A value that is another part of the configuration, as `network: ${network}`.
 REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
 
