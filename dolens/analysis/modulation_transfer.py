@@ -18,7 +18,7 @@ from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.aiming import field_line
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
@@ -75,8 +75,7 @@ def modulation_transfer(
             f"{tuple(weights.shape)}"
         )
     if isinstance(direction, str):
-        if direction not in DIRECTIONS:
-            raise InputError(f"direction must be one of {', '.join(DIRECTIONS)}, not '{direction}'")
+        check_choice(direction, DIRECTIONS, "direction")
         direction = points.new_tensor(DIRECTIONS[direction])
     share = weights / weights.sum(-1, keepdim=True)
     height = (points * direction[..., None, :]).sum(-1)

@@ -21,7 +21,7 @@ from torch import Tensor
 from dolens.diffraction.pupil_fit import PupilFit, RegularPupil
 from dolens.diffraction.reference_sphere import path_beyond
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.autograd import replay
 
 METHODS = ("auto", "fourier", "direct")
@@ -60,8 +60,7 @@ class DiffractionSettings:
     subsamples: int | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise InputError(f"method must be one of {', '.join(METHODS)}, not '{self.method}'")
+        check_choice(self.method, METHODS, "method")
         if not self.phase_error > 0.0 or not self.oversampling >= 1.0:
             raise InputError("phase_error must be positive and oversampling at least 1")
         for name, least in (("samples", 8), ("subsamples", 1)):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics import LENS_METHODS
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
@@ -24,7 +24,7 @@ from dolens.optics.materials import MIRROR, Medium, media_of
 from dolens.optics.paraxial import vergence
 from dolens.optics.paraxial_rays import ideal_lenses, reversals, with_vergences
 from dolens.optics.prescription_table import PrescriptionTable, prescription_table
-from dolens.optics.ray_tracing import check_backend, is_few, trace_rays
+from dolens.optics.ray_tracing import BACKENDS, is_few, trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes
@@ -129,7 +129,8 @@ class Lens(LensRays, InStates, nn.Module):
         self.telecentric_object = given.telecentric_object
         # A sentence where the stop is smaller than the aperture that its prescription asks for.
         self.stop_note = ""
-        self.backend = check_backend(backend)
+        check_choice(backend, BACKENDS, "backend")
+        self.backend = backend
         self.materials = tuple(materials)
         self.surfaces = ModuleTable[Surface](
             {str(number): surface for number, surface in enumerate(surfaces, 1)}

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from dolens.errors import InputError, comma_hint
+from dolens.errors import InputError, check_choice, comma_hint
 from dolens.optics.dispersion import ModelGlass, model_glass, require_wavelength
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.glass_catalog import find_glass
@@ -152,8 +152,7 @@ NO_GLASS = ("air", "occluder", MIRROR.name)
 
 def index_model(name: str) -> IndexModel:
     """The index model of that name; raises `InputError` naming the allowed ones."""
-    if name not in INDEX_MODELS:
-        raise InputError(f"index_model '{name}' is unknown; allowed: {', '.join(INDEX_MODELS)}")
+    check_choice(name, INDEX_MODELS, "index_model")
     return INDEX_MODELS[name]
 
 

@@ -214,13 +214,6 @@ FEW = 2048
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
-def check_backend(name: str) -> str:
-    """The name itself; raises `InputError` naming the allowed ones."""
-    if name not in BACKENDS:
-        raise InputError(f"backend '{name}' is unknown; allowed: {', '.join(BACKENDS)}")
-    return name
-
-
 def choose_backend(
     system: OpticalSystem, rays: Rays | None = None, others: Iterable[Tensor] = ()
 ) -> str:

@@ -43,7 +43,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError, check_choice, check_keys, did_you_mean
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.elements import DISPLACEMENTS, TILTS, Element
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.materials import IndexModel, Medium, index_model, parse_material
@@ -157,11 +157,7 @@ def phase_from(value: object, place: str, dtype: torch.dtype) -> Phase:
     require_mapping(value, where)
     row: Mapping[str, Any] = value  # type: ignore[assignment]
     kind = str(row.get("type"))
-    if kind not in PHASES:
-        raise InputError(
-            f"{where}: type '{kind}' is unknown{did_you_mean(kind, PHASES)} "
-            f"(allowed: {', '.join(PHASES)})"
-        )
+    check_choice(kind, PHASES, f"{where}: type")
     try:
         names = PHASES[kind].parameter_names(row)
         check_keys(row, (*_PHASE_KEYS, *names), where)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.diffraction.pixel_psf import with_diffraction_limit
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.rendering.chief_ray_map import chief_ray_maps
@@ -102,11 +102,7 @@ class PsfRenderer(Renderer):
             ("colours", ("each", "one")),
             ("diffraction", ("none", "limit", "wave")),
         ):
-            if getattr(self, key) not in allowed:
-                raise InputError(
-                    f"renderer: {key} '{getattr(self, key)}' is unknown; "
-                    f"allowed: {', '.join(allowed)}"
-                )
+            check_choice(getattr(self, key), allowed, f"renderer: {key}")
 
     @property
     def psf_size(self) -> int:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.paraxial_rays import Number, ParaxialNumbers
 from dolens.optics.system import OpticalSystem
@@ -67,11 +67,7 @@ class Scene(ABC):
     separate_planes: ClassVar[bool]
 
     def __post_init__(self) -> None:
-        if self.texture_scale not in ("magnification", "fixed"):
-            raise InputError(
-                f"scene.texture_scale: '{self.texture_scale}' is unknown; "
-                "allowed: magnification, fixed"
-            )
+        check_choice(self.texture_scale, ("magnification", "fixed"), "scene.texture_scale")
         for name in ("depths", "wavelengths", "texture_centre"):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         if not self.depths or not self.wavelengths:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 
 _LINEAR_LIMIT = 0.0031308
 _ENCODED_LIMIT = 0.04045
@@ -36,12 +36,6 @@ def srgb_to_linear(encoded: Tensor) -> Tensor:
 # The filters of rows 0 and 1, columns 0 and 1 → row and column of the red one; the blue one is
 # across the corner, the others are green.
 PATTERNS = {"RGGB": (0, 0), "GRBG": (0, 1), "GBRG": (1, 0), "BGGR": (1, 1)}
-
-
-def check_pattern(pattern: str) -> None:
-    """Raise `InputError` where a pattern is none of `PATTERNS`."""
-    if pattern not in PATTERNS:
-        raise InputError(f"pattern: '{pattern}' is unknown; allowed: {', '.join(PATTERNS)}")
 
 
 def mosaic(image: Tensor, pattern: str) -> Tensor:
@@ -130,7 +124,7 @@ def demosaic(raw: Tensor, pattern: str) -> Tensor:
 
 def _red_rows_and_columns(image: Tensor, pattern: str) -> tuple[Tensor, Tensor]:
     """Return whether rows (H, 1) and columns (W,) hold red filters; the others hold blue ones."""
-    check_pattern(pattern)
+    check_choice(pattern, PATTERNS, "pattern")
     row, column = PATTERNS[pattern]
     height, width = image.shape[-2:]
     rows = torch.arange(height, device=image.device) % 2 == row

@@ -7,8 +7,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
-from dolens.sensor.colour import check_pattern, demosaic, mosaic
+from dolens.errors import InputError, check_choice
+from dolens.sensor.colour import PATTERNS, demosaic, mosaic
 from dolens.sensor.noise import BatchShare, add_read_noise, add_shot_noise
 
 _MOST_BITS = 16
@@ -102,7 +102,7 @@ class Readout:
             good = value is None or _is_number(value, above=0.0)
             _require(key, value, good, "null, or a number above 0")
         if self.pattern is not None:
-            check_pattern(self.pattern)
+            check_choice(self.pattern, PATTERNS, "pattern")
 
     def at_f_number(self, f_number: float) -> Self:
         """Return the same readout, with the same exposure time, at another F-number of the lens."""

@@ -68,7 +68,7 @@ def test_long_lists_of_coefficients_stay_within_the_terminal():
         (["--tolerances", "default"], "--tolerances needs --html or --figures"),
         (["--html", "page.pdf"], "--html: a page's file ends in .html, not 'page.pdf'"),
         (["--html", "nowhere/page.html"], "--html: there is no folder 'nowhere'"),
-        (["--index-model", "mine"], "index_model 'mine' is unknown"),
+        (["--index-model", "mine"], "index_model: 'mine' is unknown"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

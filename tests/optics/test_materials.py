@@ -89,7 +89,7 @@ def test_index_and_abbe_number_come_back(nd, vd):
 
 
 def test_unknown_index_model():
-    with pytest.raises(InputError, match="index_model 'dcf' is unknown; allowed: dfc, do, paper"):
+    with pytest.raises(InputError, match="'dcf' is unknown; did you mean 'dfc'"):
         index_model("dcf")
 
 

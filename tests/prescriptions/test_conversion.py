@@ -71,7 +71,7 @@ def test_another_index_model_is_told_with_its_effect_on_the_focal_length():
     assert found.after.index_model == "dfc"
     asked = converted(SINGLET, "old.yaml", "new.txt", "do")
     assert "index_model 'dfc' became 'do'" in asked.changes
-    with pytest.raises(InputError, match="index_model 'mine' is unknown"):
+    with pytest.raises(InputError, match="index_model: 'mine' is unknown"):
         converted(SINGLET, "old.yaml", "new.txt", "mine")
 
 

@@ -110,7 +110,7 @@ def test_a_file_in_inches_scales_lengths_and_not_radians():
 @pytest.mark.parametrize(
     "row, wrong",
     [
-        ({"phase": {"type": "grateing", "grooves": 1.0}}, "type 'grateing' is unknown"),
+        ({"phase": {"type": "grateing", "grooves": 1.0}}, "type: 'grateing' is unknown"),
         ({"phase": {"type": "grating"}}, "needs 'grooves'"),
         ({"phase": {"type": "radial", "p3": 1.0}}, "'p3': coefficients of a radial phase"),
         ({"phase": {"type": "radial", "q2": 1.0}}, "'q2'"),

@@ -115,7 +115,7 @@ BAD = {
                                 "'sensor.distance' is missing"),
     "stop outside": (changed("stop", to=3), "stop must be a surface from 1 to 2, not 3"),
     "half a stop": (changed("stop", to=1.5), "'stop' must be a whole number"),
-    "unknown index model": (changed("index_model", to="dcf"), "index_model 'dcf' is unknown"),
+    "unknown index model": (changed("index_model", to="dcf"), "index_model: 'dcf' is unknown"),
     "a list": ([1, 2], "expected a mapping"),
     "nothing": (None, "expected a mapping"),
 }  # fmt: skip

@@ -312,8 +312,8 @@ def test_gradients_through_waves_are_finite_differences(root):
         ({"fields": (0, 1)}, "fields"),
         ({"size": 10}, "odd"),
         ({"pupil_samples": 0}, "pupil_samples"),
-        ({"registration": "none"}, "registration 'none'"),
-        ({"depths": "all"}, "depths 'all'"),
+        ({"registration": "none"}, "registration: 'none'"),
+        ({"depths": "all"}, "depths: 'all'"),
     ],
 )
 def test_settings_out_of_range_are_errors(settings, message):

@@ -295,7 +295,7 @@ def test_bad_settings_give_one_line_with_the_key_and_what_is_allowed(key, value)
 
 
 def test_an_unknown_pattern_is_named_with_the_known_ones():
-    with pytest.raises(InputError, match=r"'XTRANS' is unknown; allowed: RGGB, GRBG, GBRG, BGGR"):
+    with pytest.raises(InputError, match=r"'XTRANS' is unknown \(allowed: RGGB, GRBG, GBRG, BGGR"):
         Readout(pattern="XTRANS")
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.pixel_psf import with_diffraction_limit
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.views.base import (
     SCENE_OFFSET,
     Comparison,
@@ -18,7 +18,7 @@ from dolens.experiments.camera.views.base import (
     Views,
 )
 from dolens.experiments.camera.views.truth import (
-    check_truth,
+    TRUTHS,
     reference_chief_ray_map,
     sample_texture,
 )
@@ -89,7 +89,8 @@ class DepthViews(Imaging):
         if psf_depths is not None and not len(psf_depths):
             raise InputError("views.psf_depths: []; allowed: null, or depths in mm")
         self.psf_depths = None if psf_depths is None else tuple(map(float, psf_depths))
-        self.truth = check_truth(truth)
+        check_choice(truth, TRUTHS, "views.truth")
+        self.truth = truth
         if self.truth != "pinhole" and not scene.separate_planes:
             raise InputError(
                 f"views.truth: '{truth}' needs planes that make images of their own; allowed for "
@@ -99,10 +100,7 @@ class DepthViews(Imaging):
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self._reference_renderers = dict(reference_renderers or {})
-        if psf_diffraction not in ("none", "limit"):
-            raise InputError(
-                f"views.psf_diffraction '{psf_diffraction}' is unknown; allowed: none, limit"
-            )
+        check_choice(psf_diffraction, ("none", "limit"), "views.psf_diffraction")
         self.psf_diffraction = psf_diffraction
         self._f_number: float | None = None
         others = {

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.views.base import Comparison, Imaging, Shot, Views, seed_of
 from dolens.experiments.camera.views.truth import (
     CENTROIDS,
     TRUTHS,
     FieldWindows,
-    check_truth,
     field_functions,
     field_imaging,
     nearest_texel,
@@ -108,7 +107,8 @@ class FieldViews(Imaging):
         seed: int = 0,
     ) -> None:
         super().__init__(scene, renderer, readout, seed)
-        self.truth = check_truth(truth, (*TRUTHS, CENTROIDS))
+        check_choice(truth, (*TRUTHS, CENTROIDS), "views.truth")
+        self.truth = truth
         self.whole = sensor
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         window = renderer.sensor

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import say_once, with_chosen_backend
 from dolens.optics.system import OpticalSystem
@@ -34,13 +34,6 @@ from dolens.sensor.pixels import Sensor
 
 TRUTHS = ("pinhole", "chief_rays")
 CENTROIDS = "centroids"
-
-
-def check_truth(name: str, allowed: Sequence[str] = TRUTHS) -> str:
-    """The name itself; raises `InputError` naming the allowed ones."""
-    if name not in allowed:
-        raise InputError(f"views.truth: '{name}' is unknown; allowed: {', '.join(allowed)}")
-    return name
 
 
 def reference_chief_ray_map(
@@ -194,11 +187,7 @@ class FieldWindows:
     """
 
     def __init__(self, whole: Sensor, height: int, width: int, training_windows: str) -> None:
-        if training_windows not in TRAINING:
-            raise InputError(
-                f"views.training_windows: '{training_windows}' is unknown; allowed: "
-                f"{', '.join(TRAINING)}"
-            )
+        check_choice(training_windows, TRAINING, "views.training_windows")
         self.whole = whole
         self.height, self.width = height, width
         self.training_windows = training_windows

@@ -17,7 +17,7 @@ IN_A_CAMERA = {
     "scene.depths=[8000,-1]": "depth -1 mm lies inside the lens",
     "test=false": "needs test=true",
     "loss.perceptual=vgg": "auto, vgg16, download, vgg16_edges, none",
-    "readout.pattern=RGBG": "'RGBG' is unknown; allowed: RGGB",
+    "readout.pattern=RGBG": "'RGBG' is unknown; did you mean",
     "readout.bits=0": "bits is 0; allowed: null, or a whole number",
     "+variables={surfaces.5.x4: {scale: 1.0}}": "has no parameter 'surfaces.5.x4'",
     "learning_rates.optics=inf": "learning_rates",
