@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.aiming import field_line, launch
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.fields import require_from_the_front
@@ -226,9 +226,7 @@ def image_displacement(
     Raises:
         InputError: another reference, or `f_theta` of a near object.
     """
-    if reference not in DISTORTION_REFERENCES:
-        known = ", ".join(DISTORTION_REFERENCES)
-        raise InputError(f"a distortion's reference is one of {known}, not '{reference}'")
+    check_choice(reference, DISTORTION_REFERENCES, "distortion")
     infinite = vergence(scan.object_distance) == 0.0
     if reference == "f_theta" and not infinite:
         raise InputError(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.surfaces.zernike import FRINGE_TERMS, ZernikeTerm, fringe, jacobi, noll
 
 ORDERS = {"fringe": fringe, "standard": noll}
@@ -65,8 +65,7 @@ def zernike_terms(order: str, count: int = TERMS) -> tuple[ZernikeTerm, ...]:
     Raises:
         InputError: another order, or a number that it does not have.
     """
-    if order not in ORDERS:
-        raise InputError(f"a Zernike order is one of {', '.join(ORDERS)}, not '{order}'")
+    check_choice(order, ORDERS, "order")
     most = FRINGE_TERMS if order == "fringe" else _MOST_STANDARD
     if not 1 <= count <= most:
         raise InputError(f"{order} Zernike terms are 1 to {most}, not {count}")

@@ -104,5 +104,5 @@ def test_f_theta_is_that_of_fields_in_degrees():
     (near,) = field_scans(lens, 100.0, 5.0, 3)
     with pytest.raises(InputError, match="object at infinity"):
         field_curves(lens, near, [500.0], "f_theta")
-    with pytest.raises(InputError, match="f_tan_theta, f_theta, not 'fisheye'"):
+    with pytest.raises(InputError, match=r"distortion: 'fisheye' .*f_tan_theta, f_theta"):
         field_curves(lens, scan, [500.0], "fisheye")
