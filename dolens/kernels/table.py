@@ -158,7 +158,7 @@ OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}
 class IndexMap:
     """The map is d(indices)/d(variables), for variables that media depend on.
 
-    The derivatives themselves, (E, wavelengths), are given beside it: they change with every step.
+    The derivatives themselves change with every step; see `MapOfLenses`.
 
     Attributes:
         rows: (E,), int64: which row of `SurfaceTable.indices`, a medium.
@@ -189,6 +189,33 @@ class VariableMap:
     weights: Tensor
     count: int
     indices: IndexMap | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MapOfLenses:
+    """The map of the variables of L lenses holds what each of them has for itself, too.
+
+    It is new at every step; the map within stays, so that it is sorted once.
+
+    Attributes:
+        map: the same for all lenses, of E entries.
+        weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
+        index_derivatives: (L, entries, wavelengths), float64, for `map.indices`; None without.
+    """
+
+    map: VariableMap
+    weights: Tensor | None = None
+    index_derivatives: Tensor | None = None
+
+    @property
+    def count(self) -> int:
+        """Return P, the number of variables."""
+        return self.map.count
+
+    def of(self, lenses: Tensor | slice) -> "MapOfLenses":
+        """Return the map of some of the lenses."""
+        parts = (self.weights, self.index_derivatives)
+        return MapOfLenses(self.map, *(None if p is None else p[lenses] for p in parts))
 
 
 # Smallest cosine that is divided by, and its square, which is far above the smallest float32.

@@ -17,6 +17,7 @@ from torch.func import jacfwd
 from dolens.errors import InputError
 from dolens.kernels.least_squares_sums import least_squares_sums
 from dolens.kernels.operators import kernels_of_lenses
+from dolens.kernels.table import MapOfLenses
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
 from dolens.optics.ray_tracing import FlatRays, choose_backend, flat_rays, trace_rays
@@ -140,7 +141,7 @@ def ray_jacobian(
     flat = flat_rays(system, rays)
     table, entries = pack_with_variables(system, flat.wavelengths, leaves)
     kernels = kernels_of_lenses(flat.position)
-    found = kernels.ray_jacobians(table.alone(), entries, outputs, _of_one_lens(flat))
+    found = kernels.ray_jacobians(table.alone(), MapOfLenses(entries), outputs, _of_one_lens(flat))
     valid, values, jacobian = (part[0] for part in found)
     if flat.before is not None and "path_length" in outputs:
         values[outputs.index("path_length")] += torch.where(valid, flat.before, 0.0)
@@ -202,7 +203,7 @@ def normal_equations(
         own = None if weight is None else weight[None]
         kernels = kernels_of_lenses(flat.position)
         found_sums = kernels.normal_equations(
-            *(table.alone(), entries, outputs, _of_one_lens(flat)),
+            *(table.alone(), MapOfLenses(entries), outputs, _of_one_lens(flat)),
             *(target[None], own, group, groups),
         )
         sums = tuple(part[0] for part in found_sums)

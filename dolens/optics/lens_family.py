@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.func import jacfwd, vmap
 
 from dolens.kernels.operators import kernels_of_lenses
-from dolens.kernels.table import IndexMap, SurfaceTable, VariableMap
+from dolens.kernels.table import IndexMap, MapOfLenses, SurfaceTable, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
 from dolens.optics.ray_tracing import choose_backend, trace_rays
@@ -181,22 +181,21 @@ class LensFamily:
         parts = {n: values[s].reshape(self._shapes[n]) for n, s in self.columns.items()}
         return record_values(self.lens.system(parts))
 
-    def map_at(
-        self, values: Tensor, variables: VariableMap | None = None
-    ) -> tuple[VariableMap, Tensor | None]:
-        """Return the map of the variables, and its weights (L, E) where lenses have their own.
+    def map_at(self, values: Tensor, variables: MapOfLenses | None = None) -> MapOfLenses:
+        """Return the map of the variables of lenses, with weights where these have their own.
 
         Args:
             values: (L, P).
             variables: as in `jacobians`.
         """
-        given = variables or self.map
+        given = variables or MapOfLenses(self.map)
         if not self._has_poses:
-            return given, None
+            return given
         derivatives = vmap(jacfwd(self._records_of))(values.to(self._table.values)).double()
         places, columns = (derivatives != 0.0).any(0).nonzero(as_tuple=True)
         weights = derivatives[:, places, columns]
-        return VariableMap(places, columns, weights[0], given.count, given.indices), weights
+        own = VariableMap(places, columns, weights[0], given.count, given.map.indices)
+        return MapOfLenses(own, weights, given.index_derivatives)
 
     def wavelength_columns(self, rays: FamilyRays) -> Tensor | None:
         """Return each ray's column of the indices; None where there is but one wavelength."""
@@ -278,8 +277,7 @@ class LensFamily:
         rays: FamilyRays,
         outputs: Sequence[str] = ("x", "y"),
         indices: Tensor | None = None,
-        variables: VariableMap | None = None,
-        index_derivatives: Tensor | None = None,
+        variables: MapOfLenses | None = None,
     ) -> FamilyJacobian:
         """Return the rays on the sensors and their derivatives with respect to the variables.
 
@@ -289,16 +287,12 @@ class LensFamily:
             outputs: some of `dolens.optics.jacobian.OUTPUTS`.
             indices: as in `table`.
             variables: with indices among them, see `with_indices`; None: the family's own.
-            index_derivatives: (L, E, wavelengths), of the indices with respect to these.
         """
-        own, weights = self.map_at(values, variables)
         found = kernels_of_lenses(rays.position).ray_jacobians(
             self.table(values, indices),
-            own,
+            self.map_at(values, variables),
             outputs,
             (rays.position, rays.direction, self.wavelength_columns(rays)),
-            weights,
-            index_derivatives,
         )
         return FamilyJacobian(*found)
 
@@ -313,8 +307,7 @@ class LensFamily:
         groups: int = 0,
         outputs: Sequence[str] = ("x", "y"),
         indices: Tensor | None = None,
-        variables: VariableMap | None = None,
-        index_derivatives: Tensor | None = None,
+        variables: MapOfLenses | None = None,
     ) -> FamilySums:
         """Return JᵀWJ, JᵀWr and Σ w·r² of residuals r = output - target, lens by lens.
 
@@ -327,21 +320,17 @@ class LensFamily:
             groups: G.
             outputs: K of `dolens.optics.jacobian.OUTPUTS`.
             indices: as in `table`.
-            variables: as in `jacobians`, and the last.
-            index_derivatives: of the media.
+            variables: as in `jacobians`.
         """
-        own, weights = self.map_at(values, variables)
         head, jtr, jtj, sums = kernels_of_lenses(rays.position).normal_equations(
             self.table(values, indices),
-            own,
+            self.map_at(values, variables),
             outputs,
             (rays.position, rays.direction, self.wavelength_columns(rays)),
             target,
             weight,
             group,
             groups,
-            weights,
-            index_derivatives,
         )
         k = len(outputs)
         return FamilySums(
@@ -419,18 +408,13 @@ def jacobian_parts(
 ) -> Iterator[tuple[slice, FamilyJacobian]]:
     """Yield which lenses, and what `LensFamily.jacobians` returns of them; arguments as above."""
     table, column = family.table(values), family.wavelength_columns(rays)
-    variables, weights = family.map_at(values)
+    variables = family.map_at(values)
     ray_jacobians = kernels_of_lenses(rays.position).ray_jacobians
     for rows in _slices(len(values), size):
         part = replace(table, values=table.values[rows], indices=table.indices[rows])
         own = rays.of_each(len(part.values))
-        found = ray_jacobians(
-            part,
-            variables,
-            outputs,
-            (own.position, own.direction, column),
-            None if weights is None else weights[rows],
-        )
+        given = (own.position, own.direction, column)
+        found = ray_jacobians(part, variables.of(rows), outputs, given)
         yield rows, FamilyJacobian(*found)
 
 

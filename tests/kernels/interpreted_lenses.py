@@ -10,6 +10,7 @@ from torch.func import jacfwd, vmap
 from dolens import Rays
 from dolens.kernels.cpu import lenses as cpu
 from dolens.kernels.cuda import lenses as cuda
+from dolens.kernels.table import MapOfLenses
 from dolens.optics import lens_family
 from dolens.optics.lens_family import FamilyRays, LensFamily
 from dolens.optics.ray_tracing import trace_rays
@@ -94,13 +95,11 @@ def test_jacobians_are_those_of_the_cpu_kernels_and_of_vmap(family, values, rays
     outputs = ("y", "path_length", "m")
     rows = torch.tensor([1])
     slope = torch.tensor([[[0.7, 1.6]], [[0.8, 1.5]]], dtype=torch.float64)
-    media = {
-        "variables": family.with_indices(rows, torch.tensor([family.count]), family.count + 1),
-        "index_derivatives": slope,
-    }
-    found = family.jacobians(values, rays, outputs, **media)
+    own = family.with_indices(rows, torch.tensor([family.count]), family.count + 1)
+    variables = MapOfLenses(own, index_derivatives=slope)
+    found = family.jacobians(values, rays, outputs, variables=variables)
     on_gpu(cpu)
-    expected = family.jacobians(values, rays, outputs, **media)
+    expected = family.jacobians(values, rays, outputs, variables=variables)
     assert torch.equal(found.valid, expected.valid)
     torch.testing.assert_close(found.values, expected.values, **EXACT)
     scale = expected.derivatives.abs().amax((1, 3), keepdim=True)

@@ -5,6 +5,7 @@ import torch
 
 import dolens
 from dolens import Rays, load_lens
+from dolens.kernels.table import MapOfLenses
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.lens_family import FamilyRays, LensFamily
 from dolens.tolerancing.tolerances import with_glass_elements
@@ -163,10 +164,10 @@ def found_on(device, kind, dtype):
     indices = family.table(values).indices.clone().requires_grad_()
     media = {
         "indices": indices.detach(),
-        "variables": family.with_indices(
-            torch.tensor([3]), torch.tensor([family.count]), family.count + 1
+        "variables": MapOfLenses(
+            family.with_indices(torch.tensor([3]), torch.tensor([family.count]), family.count + 1),
+            index_derivatives=torch.ones((FAMILY, 1, 3), dtype=torch.float64, device=device),
         ),
-        "index_derivatives": torch.ones((FAMILY, 1, 3), dtype=torch.float64, device=device),
     }
     leaf = values.clone().requires_grad_()
     hit = family.trace(leaf, rays, indices)

@@ -8,6 +8,7 @@ from torch.func import vmap
 
 import dolens
 from dolens import Rays
+from dolens.kernels.table import MapOfLenses
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.optics.lens_family import (
     FamilyRays,
@@ -154,8 +155,10 @@ def test_indices_are_variables(family, values, rays):
         values,
         rays,
         indices=base,
-        variables=family.with_indices(rows, columns, family.count + 1),
-        index_derivatives=slope.contiguous(),
+        variables=MapOfLenses(
+            family.with_indices(rows, columns, family.count + 1),
+            index_derivatives=slope.contiguous(),
+        ),
     )
     step = 1e-6
     ends = []
@@ -221,10 +224,12 @@ def test_indices_vary_beside_poses():
         jacobians = family.jacobians(
             (family.start + 1e-2 * off).to(dtype),
             FamilyRays(position.to(dtype), direction),
-            variables=family.with_indices(
-                torch.tensor([1]), torch.tensor([family.count]), family.count + 1
+            variables=MapOfLenses(
+                family.with_indices(
+                    torch.tensor([1]), torch.tensor([family.count]), family.count + 1
+                ),
+                index_derivatives=torch.ones((2, 1, 1), dtype=torch.float64),
             ),
-            index_derivatives=torch.ones((2, 1, 1), dtype=torch.float64),
         )
         found.append(jacobians.derivatives.double())
     scale = found[1].abs().amax((0, 3), keepdim=True)

@@ -27,7 +27,7 @@ from dolens.kernels.cpu.jacobian import jacobian_driver
 from dolens.kernels.cpu.layout import BLOCK, UNBOUNDED
 from dolens.kernels.cpu.least_squares import normal_equations_driver
 from dolens.kernels.cpu.program import Derivatives, Program, rays_of_a_chunk
-from dolens.kernels.table import SurfaceTable, VariableMap
+from dolens.kernels.table import MapOfLenses, SurfaceTable
 
 # Fewer rays than these, of all lenses, are done sooner than another thread is woken.
 _SMALL_TRACE, _SMALL_DERIVATIVES = 1 << 13, 1 << 10
@@ -134,21 +134,17 @@ def trace_adjoint(
 
 def ray_jacobians(
     table: SurfaceTable,
-    variables: VariableMap,
+    variables: MapOfLenses,
     outputs: Sequence[str],
     rays: RayTensors,
-    weights: Tensor | None = None,
-    index_derivatives: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the outputs of every ray of every lens and their derivatives.
 
     Args:
         table: as in `trace`.
-        variables: P of them, of E entries, the same for all lenses.
+        variables: P of them.
         outputs: K names of `dolens.kernels.table.OUTPUT_ROWS`.
         rays: as in `trace`.
-        weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
-        index_derivatives: (L, entries, wavelengths), float64, for `variables.indices`.
 
     Returns:
         valid (L, N), bool; outputs (L, K, N); derivatives (L, K, P, N); zero where a ray is not
@@ -162,9 +158,9 @@ def ray_jacobians(
     jacobian = position.new_empty((lenses, wanted, variables.count, count))
     if lenses and count:
         chunk = rays_of_a_chunk(count, 1)
-        found = _derivatives(table, variables, outputs, rays, chunk, 0, index_derivatives)
+        found = _derivatives(table, variables, outputs, rays, chunk, 0)
         by_lens = _lenses_of(table, *rays[:2])
-        by_lens |= _weights_of(found, weights, index_derivatives)
+        by_lens |= _weights_of(found, variables)
         for place, tensor in (
             (jobs.OUT_VALID, valid),
             (jobs.OUT_VALUES, values),
@@ -179,15 +175,13 @@ def ray_jacobians(
 
 def normal_equations(
     table: SurfaceTable,
-    variables: VariableMap,
+    variables: MapOfLenses,
     outputs: Sequence[str],
     rays: RayTensors,
     target: Tensor,
     weight: Tensor | None = None,
     group: Tensor | None = None,
     groups: int = 0,
-    weights: Tensor | None = None,
-    index_derivatives: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return sums over the valid rays of every lens for least squares with r = output - target.
 
@@ -201,8 +195,6 @@ def normal_equations(
         group: (N,), int64, contiguous, from 0 to `groups` - 1, the same for all lenses; None: no
             sums by group.
         groups: G.
-        weights: as in `ray_jacobians`, and the next.
-        index_derivatives: of the media.
 
     Returns:
         All float64: number of rays and Σ w·r² (L, 2); Jᵀwr (L, P); JᵀwJ (L, P, P); and by groups
@@ -218,13 +210,13 @@ def normal_equations(
     sums = torch.zeros((lenses, chunks, length), dtype=torch.float64)
     if lenses and count:
         further = p + 1 + wanted
-        found = _derivatives(table, variables, outputs, rays, chunk, further, index_derivatives)
+        found = _derivatives(table, variables, outputs, rays, chunk, further)
         job = found.program.job
         found.program.point(TARGET=target, WEIGHT=weight, GROUP=group, SUMS=sums)
         job[jobs.SUM_LENGTH], job[jobs.GROUPS] = length, groups
         job[jobs.TARGET_ROW], job[jobs.TARGET_COLUMN] = target.stride()[1:]
         by_lens = _lenses_of(table, *rays[:2]) | {jobs.SUMS: sums, jobs.TARGET: target}
-        by_lens |= _weights_of(found, weights, index_derivatives)
+        by_lens |= _weights_of(found, variables)
         if weight is not None:
             job[jobs.WEIGHT_ROW] = weight.stride(1)
             by_lens[jobs.WEIGHT] = weight
@@ -245,15 +237,13 @@ def normal_equations(
                     values=table.values[overflown].double(),
                     indices=table.indices[overflown],
                 ),
-                variables,
+                variables.of(overflown),
                 outputs,
                 (position[overflown].double(), rays[1][overflown].double(), rays[2]),
                 target[overflown].double(),
                 None if weight is None else weight[overflown].double(),
                 group,
                 groups,
-                None if weights is None else weights[overflown],
-                None if index_derivatives is None else index_derivatives[overflown],
             )
             first = (head.clone(), right.clone(), square, rest.clone())
             for part, better in zip(first, again, strict=True):
@@ -280,29 +270,26 @@ def _lenses_of(table: SurfaceTable, position: Tensor, direction: Tensor) -> dict
 
 def _derivatives(
     table: SurfaceTable,
-    variables: VariableMap,
+    variables: MapOfLenses,
     outputs: Sequence[str],
     rays: RayTensors,
     chunk: int,
     further: int,
-    index_derivatives: Tensor | None,
 ) -> Derivatives:
     """Return the program of derivatives of the first lens."""
-    first = None if index_derivatives is None else index_derivatives[0]
     of_first = (rays[0][0], rays[1][0], rays[2])
-    return Derivatives(_first(table), variables, outputs, of_first, chunk, further, first)
+    slopes = variables.index_derivatives
+    first = None if slopes is None else slopes[0]
+    return Derivatives(_first(table), variables.map, outputs, of_first, chunk, further, first)
 
 
-def _weights_of(
-    found: Derivatives, weights: Tensor | None, index_derivatives: Tensor | None
-) -> dict[int, Tensor]:
+def _weights_of(found: Derivatives, variables: MapOfLenses) -> dict[int, Tensor]:
     """Point to the weights of every lens; return them by their places."""
     by_lens: dict[int, Tensor] = {}
-    if weights is not None:
-        sorted_weights = found.hold(weights)
-        by_lens[jobs.ENTRY_WEIGHTS] = sorted_weights
-    if index_derivatives is not None:
-        by_lens[jobs.INDEX_WEIGHTS] = index_derivatives
+    if variables.weights is not None:
+        by_lens[jobs.ENTRY_WEIGHTS] = found.hold(variables.weights)
+    if variables.index_derivatives is not None:
+        by_lens[jobs.INDEX_WEIGHTS] = variables.index_derivatives
     return by_lens
 
 

@@ -16,7 +16,7 @@ from dolens.kernels.cuda.jacobian import jacobian_kernel
 from dolens.kernels.cuda.layout import STATE
 from dolens.kernels.cuda.trace import adjoint_kernel, forward_kernel
 from dolens.kernels.least_squares_sums import least_squares_sums
-from dolens.kernels.table import SurfaceTable, VariableMap
+from dolens.kernels.table import MapOfLenses, SurfaceTable
 
 RayTensors = tuple[Tensor, Tensor, Tensor | None]
 # Numbers of a Jacobian, or of groups, that are held at a time while normal equations are added up.
@@ -130,21 +130,17 @@ def trace_adjoint(
 
 def ray_jacobians(
     table: SurfaceTable,
-    variables: VariableMap,
+    variables: MapOfLenses,
     outputs: Sequence[str],
     rays: RayTensors,
-    weights: Tensor | None = None,
-    index_derivatives: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the outputs of every ray of every lens and their derivatives.
 
     Args:
         table: as in `trace`.
-        variables: P of them, of E entries, the same for all lenses.
+        variables: P of them.
         outputs: K names of `dolens.kernels.table.OUTPUT_ROWS`.
         rays: as in `trace`.
-        weights: (L, E), float64, in the place of those of the map; None: they hold for all lenses.
-        index_derivatives: (L, entries, wavelengths), float64, for `variables.indices`.
 
     Returns:
         valid (L, N), bool; outputs (L, K, N); derivatives (L, K, P, N); zero where a ray is not
@@ -162,12 +158,13 @@ def ray_jacobians(
     if lenses == 0 or count == 0:
         return valid.bool(), found, jacobian
     codes, media = prepared(table, position)
-    entries = device_entries(table, variables, outputs, position.device)
+    entries = device_entries(table, variables.map, outputs, position.device)
+    weights, slopes = variables.weights, variables.index_derivatives
     own = (entries.weights if weights is None else weights[:, entries.order]).to(values)
     of_index = None
-    if variables.indices is not None:
-        assert index_derivatives is not None  # they go with the map
-        of_index = index_derivatives.to(values).contiguous()
+    if variables.map.indices is not None:
+        assert slopes is not None  # they go with the map
+        of_index = slopes.to(values).contiguous()
     block, steps = device_table.JACOBIAN_BLOCK, len(codes.codes)
     blocks = triton.cdiv(count, block)
     kept = (steps + 1) * STATE.value * block
@@ -192,15 +189,13 @@ def ray_jacobians(
 
 def normal_equations(
     table: SurfaceTable,
-    variables: VariableMap,
+    variables: MapOfLenses,
     outputs: Sequence[str],
     rays: RayTensors,
     target: Tensor,
     weight: Tensor | None = None,
     group: Tensor | None = None,
     groups: int = 0,
-    weights: Tensor | None = None,
-    index_derivatives: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return sums over the valid rays of every lens for least squares with r = output - target.
 
@@ -216,8 +211,6 @@ def normal_equations(
         weight: (L, N); None: one.
         group: (N,), int64, from 0 to `groups` - 1, the same for all lenses; None: no sums by group.
         groups: G.
-        weights: as in `ray_jacobians`, and the next.
-        index_derivatives: of the media.
 
     Returns:
         All float64: number of rays and Σ w·r² (L, 2); Jᵀwr (L, P); JᵀwJ (L, P, P); and by groups
@@ -240,15 +233,13 @@ def normal_equations(
             part = slice(start, start + few_rays)
             valid, values, jacobian = ray_jacobians(
                 lens,
-                variables,
+                variables.of(some),
                 outputs,
                 (
                     position[some, part],
                     direction[some, part],
                     None if which is None else which[part],
                 ),
-                None if weights is None else weights[some],
-                None if index_derivatives is None else index_derivatives[some],
             )
             added = least_squares_sums(
                 valid,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dolens.kernels.table import VariableMap
+from dolens.kernels.table import MapOfLenses, VariableMap
 from dolens.lens_search.arrangement import AIR, Arrangement
 from dolens.lens_search.glass.choice import GlassSet
 from dolens.optics.lens_family import FamilyJacobian, FamilyRays, FamilySums, LensFamily
@@ -88,16 +88,17 @@ class FamilyOfGlasses:
             rows.repeat_interleave(count), columns, first + elements * count
         )
 
-    def _given(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the family's values, the indices (L, media, W), and their derivatives."""
+    def _given(self, values: Tensor) -> tuple[Tensor, Tensor, MapOfLenses | None]:
+        """Return the family's values, the indices (L, media, W), and the map with indices."""
         own, coordinates, numbers = self.parts(values)
         rows, media = self._glass_gaps
         indices = self._air.repeat(len(values), 1, 1)
         indices[:, rows] = self.glasses.index(coordinates, numbers)[:, media]
-        if not self.free:
+        if self._map is None:
             return own, indices, None
         slopes = self.glasses.basis.slopes.repeat(len(media), 1)
-        return own, indices, slopes.expand(len(values), -1, -1).contiguous()
+        slopes = slopes.expand(len(values), -1, -1).contiguous()
+        return own, indices, MapOfLenses(self._map, index_derivatives=slopes)
 
     @property
     def _without(self) -> int:
@@ -115,17 +116,9 @@ class FamilyOfGlasses:
         groups: int,
     ) -> FamilySums:
         """Return sums as `LensFamily.normal_equations` does, for all variables."""
-        own, indices, slopes = self._given(values)
+        own, indices, variables = self._given(values)
         found = self.family.normal_equations(
-            own,
-            rays,
-            target,
-            weight,
-            group,
-            groups,
-            indices=indices,
-            variables=self._map,
-            index_derivatives=slopes,
+            own, rays, target, weight, group, groups, indices=indices, variables=variables
         )
         more = self._without
         return replace(
@@ -137,8 +130,8 @@ class FamilyOfGlasses:
 
     def jacobians(self, values: Tensor, rays: FamilyRays, outputs: Sequence[str]) -> FamilyJacobian:
         """Return derivatives as `LensFamily.jacobians` does, with respect to all variables."""
-        own, indices, slopes = self._given(values)
-        found = self.family.jacobians(own, rays, outputs, indices, self._map, slopes)
+        own, indices, variables = self._given(values)
+        found = self.family.jacobians(own, rays, outputs, indices, variables)
         return replace(found, derivatives=pad(found.derivatives, (0, 0, 0, self._without)))
 
     def trace(self, values: Tensor, rays: FamilyRays) -> TracedRays:
