@@ -86,19 +86,6 @@ def spectral_shares(
     return shares / shares.sum()
 
 
-def that_count(
-    lens: Lens,
-    wavelengths: Sequence[float] | Tensor,
-    weights: Sequence[float] | Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return the wavelengths (nm) whose weight is not zero, and their shares, both (W,).
-
-    Arguments are those of `spectral_shares`.
-    """
-    shares, waves = spectral_shares(lens, wavelengths, weights), as_wavelengths(wavelengths)
-    return waves[shares > 0.0], shares[shares > 0.0]
-
-
 def _own_weights(lens: Lens, waves: Tensor) -> Sequence[float] | Tensor:
     """Return the lens's weights of its own wavelengths; ones for others."""
     own = torch.tensor(lens.wavelengths or (), dtype=torch.float64)

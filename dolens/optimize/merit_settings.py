@@ -7,8 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions, conditions, field_shares
-from dolens.analysis.fields_and_wavelengths import that_count
+from dolens.analysis.conditions import Conditions, conditions
 from dolens.analysis.pupil_quadrature import (
     SpotRays,
     gaussian_quadrature,
@@ -114,20 +113,20 @@ class MeritSettings:
             InputError: neither the settings nor the lens name fields or wavelengths, a field is not
                 a pair, or weights do not fit.
         """
-        fields, weights = self._fields(lens)
-        waves, shares = self._spectrum(lens)
-        found = conditions(lens, fields, waves, wavelength_weights=shares)
-        return replace(found, field_weights=weights / weights.sum())
-
-    def _fields(self, lens: Lens) -> tuple[list[Sequence[float]], Tensor]:
-        """Return the fields whose weight is not zero, and their weights (F,)."""
-        fields = self._all_fields(lens)
-        if self.field_weights is None:
-            weights = field_shares(lens, torch.tensor([list(f) for f in fields]).double())
-        else:
-            weights = _weights("field_weights", self.field_weights, len(fields))
-        counts = weights > 0.0
-        return [f for f, counted in zip(fields, counts, strict=True) if counted], weights[counts]
+        points = self._all_fields(lens)
+        waves = self.wavelengths if self.wavelengths is not None else lens.wavelengths
+        if not waves:
+            raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
+        require_wavelengths(waves, "merit.wavelengths")
+        if self.wavelength_weights is not None:
+            _weights("wavelength_weights", self.wavelength_weights, len(waves))
+        found = conditions(lens, points, waves, wavelength_weights=self.wavelength_weights)
+        shares = found.field_weights
+        if self.field_weights is not None:
+            shares = _weights("field_weights", self.field_weights, len(points))
+        counts = shares > 0.0
+        fields, shares = found.fields[counts], shares[counts] / shares.sum()
+        return replace(found, fields=fields, field_weights=shares).that_count()
 
     def _all_fields(self, lens: Lens) -> Sequence[Sequence[float]]:
         if self.fields is not None:
@@ -144,17 +143,6 @@ class MeritSettings:
         if lens.fields is None:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
         return lens.fields.points
-
-    def _spectrum(self, lens: Lens) -> tuple[Tensor, Tensor]:
-        """Return the wavelengths that count, nm, and their shares, which sum to one, both (W,)."""
-        wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
-        if not wavelengths:
-            raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
-        require_wavelengths(wavelengths, "merit.wavelengths")
-        weights = self.wavelength_weights
-        if weights is not None:
-            _weights("wavelength_weights", weights, len(wavelengths))
-        return that_count(lens, wavelengths, weights)
 
     def rays(self, lens: Lens) -> SpotRays:
         """Return the rays of all spots that pass the lens as it is now.
@@ -184,7 +172,8 @@ class MeritSettings:
 
     def weights(self, lens: Lens) -> Tensor:
         """Return the weight (S,) of every spot of `rays`; they sum to one."""
-        weights = torch.outer(self._fields(lens)[1], self._spectrum(lens)[1]).flatten()
+        where = self.conditions_of(lens)
+        weights = torch.outer(where.field_weights, where.weights).flatten()
         return weights / weights.sum()
 
     def states_of(self, lens: Lens) -> dict[str, float]:

@@ -13,7 +13,7 @@ from dolens.alignment.chart_fit import ChartFit, Prior, fit_chart
 from dolens.alignment.chart_model import ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight
 from dolens.alignment.spot_moments import one_thread
-from dolens.analysis.fields_and_wavelengths import that_count
+from dolens.analysis.fields_and_wavelengths import spectral_shares
 from dolens.errors import InputError
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.bench import check_precision
@@ -211,7 +211,10 @@ class ChartPhotographsModule(Analysis):
     def _light_of_scenes(self) -> Sequence[float]:
         """Return the lens's wavelengths that count (nm), or else those of the chart."""
         own = self.lens.wavelengths
-        return that_count(self.lens, own)[0].tolist() if own else self.model.rays.wavelengths
+        if not own:
+            return self.model.rays.wavelengths
+        shares = spectral_shares(self.lens, own).tolist()
+        return [nm for nm, share in zip(own, shares, strict=True) if share > 0.0]
 
     def _fit(self, model: ChartModel, seen: MarkWindows, prior: Prior) -> ChartFit:
         rays = model.rays
