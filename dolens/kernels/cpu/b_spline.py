@@ -39,6 +39,8 @@ from dolens.kernels.cpu.layout import (
     STENCIL_PLACE,
     UNBOUNDED,
 )
+from dolens.kernels.cpu.translation import scalar
+from dolens.kernels.cubics import b_splines, b_splines_second
 
 MORE_KNOTS = 4  # than coefficients
 # Work rows: the knots about x and about y, and the coefficients, four rows of four; then the first
@@ -62,7 +64,7 @@ class Spline(NamedTuple):
 
 @cache
 def _spline(real: types.Type) -> Spline:
-    zero, one, three, six = real(0.0), real(1.0), real(3.0), real(6.0)
+    zero, one = real(0.0), real(1.0)
 
     @njit(**OPTIONS)
     def span(knots, count, u):  # noqa: ANN001, ANN202
@@ -113,42 +115,9 @@ def _spline(real: types.Type) -> Spline:
                     w[C0 + BLOCK * (4 * j + k) + i] = c[k]
             w[FIRST_COLUMN + i], w[FIRST_ROW + i] = real(column), real(row)
 
-    @njit(**OPTIONS)
-    def basis(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
-        """Return values and slopes of the four basis functions of the span [c, d]; see
-        `cubic_basis`.
-        """
-        inside = low if u < low else u
-        inside = high if inside > high else inside
-        beyond = u - inside
-        after_a, after_b, after_c = inside - a, inside - b, inside - c
-        to_d, to_e, to_f = d - inside, e - inside, f - inside
-        width = one / (d - c)
-        p0, p1 = to_d * width / (d - b), after_c * width / (e - c)
-        q0 = to_d * p0 / (d - a)
-        q1 = (after_b * p0 + to_e * p1) / (e - b)
-        q2 = after_c * p1 / (f - c)
-        d0, d1, d2, d3 = -three * q0, three * (q0 - q1), three * (q1 - q2), three * q2
-        return (
-            to_d * q0 + beyond * d0,
-            after_a * q0 + to_e * q1 + beyond * d1,
-            after_b * q1 + to_f * q2 + beyond * d2,
-            after_c * q2 + beyond * d3,
-            d0,
-            d1,
-            d2,
-            d3,
-        )
-
-    @njit(**OPTIONS)
-    def second_derivatives(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
-        """Return the second derivatives of the four; zero beyond the ends."""
-        scale = zero if u < low or u > high else six
-        width = one / (d - c)
-        p0, p1 = (d - u) * width / (d - b), (u - c) * width / (e - c)
-        r0, r1, r2 = -p0 / (d - a), (p0 - p1) / (e - b), p1 / (f - c)
-        return -scale * r0, scale * (r0 - r1), scale * (r1 - r2), scale * r2
-
+    basis, second_derivatives = (
+        scalar(function, real, "always") for function in (b_splines, b_splines_second)
+    )
     return Spline(fetch, basis, second_derivatives)
 
 

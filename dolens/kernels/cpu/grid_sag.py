@@ -36,6 +36,8 @@ from dolens.kernels.cpu.layout import (
     SLOPE_Y,
     UNBOUNDED,
 )
+from dolens.kernels.cpu.translation import scalar
+from dolens.kernels.cubics import hermite, hermite_second
 
 # Behind the even asphere's numbers: spacings, decentre, nodes.
 NODES = 4
@@ -47,8 +49,8 @@ PLACE_X, PLACE_Y, CELL = (FURTHER + BLOCK * row for row in range(3))
 
 @cache
 def _cells(real: types.Type) -> tuple[Any, Any, Any]:
-    """Compile the search for cells, Hermite's basis, and its second derivatives."""
-    zero, half, one, two, six = real(0.0), real(0.5), real(1.0), real(2.0), real(6.0)
+    """Return the search for cells, Hermite's basis, and its second derivatives."""
+    zero, half = real(0.0), real(0.5)
 
     @njit(**OPTIONS)
     def place_of(u, spacing, count):  # noqa: ANN001, ANN202
@@ -71,33 +73,9 @@ def _cells(real: types.Type) -> tuple[Any, Any, Any]:
                 w[CELL + BLOCK * k + i] = own[lower + k]
                 w[CELL + BLOCK * (8 + k) + i] = own[upper + k]
 
-    @njit(**OPTIONS)
-    def basis(t, spacing):  # noqa: ANN001, ANN202
-        """Return weights of value and slope at both nodes, and their derivatives."""
-        held = zero if t < zero else (one if t > one else t)
-        past = (t - held) * spacing
-        s = one - held
-        bell = six * held * s / spacing
-        d1, d3 = s * (s - two * held), held * (held - two * s)
-        return (
-            s * s * (one + two * held) - past * bell,
-            held * s * s * spacing + past * d1,
-            held * held * (one + two * s) + past * bell,
-            past * d3 - held * held * s * spacing,
-            -bell,
-            d1,
-            bell,
-            d3,
-        )
-
-    @njit(**OPTIONS)
-    def second_derivatives(t, spacing):  # noqa: ANN001, ANN202
-        """Return the second derivatives of the four weights; zero beyond the grid."""
-        if t < zero or t > one:
-            return zero, zero, zero, zero
-        bend = six * (two * t - one) / (spacing * spacing)
-        return bend, (six * t - two * two) / spacing, -bend, (six * t - two) / spacing
-
+    basis, second_derivatives = (
+        scalar(function, real, "always") for function in (hermite, hermite_second)
+    )
     return fetch, basis, second_derivatives
 
 

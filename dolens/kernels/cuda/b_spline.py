@@ -7,11 +7,14 @@ The record holds the knots in x, the knots in y, and the coefficients, rows alon
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import add_sum, divide, first_of
+from dolens.kernels import cubics
+from dolens.kernels.cuda.arithmetic import add_sum, first_of
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
+from dolens.kernels.cuda.translation import compiled
 
 MORE_KNOTS = tl.constexpr(4)  # than coefficients
+b_splines, b_splines_second = compiled(cubics.b_splines), compiled(cubics.b_splines_second)
 
 
 @triton.jit
@@ -38,27 +41,7 @@ def _basis(around, u, low, high):
     """
     a, b, c = tl.load(around + 1), tl.load(around + 2), tl.load(around + 3)
     d, e, f = tl.load(around + 4), tl.load(around + 5), tl.load(around + 6)
-    inside = tl.where(u < low, low, u)
-    inside = tl.where(inside > high, high, inside)
-    beyond = u - inside
-    after_a, after_b, after_c = inside - a, inside - b, inside - c
-    to_d, to_e, to_f = d - inside, e - inside, f - inside
-    width = divide(1.0, d - c)
-    p0, p1 = divide(to_d * width, d - b), divide(after_c * width, e - c)
-    q0 = divide(to_d * p0, d - a)
-    q1 = divide(after_b * p0 + to_e * p1, e - b)
-    q2 = divide(after_c * p1, f - c)
-    d0, d1, d2, d3 = -3.0 * q0, 3.0 * (q0 - q1), 3.0 * (q1 - q2), 3.0 * q2
-    return (
-        to_d * q0 + beyond * d0,
-        after_a * q0 + to_e * q1 + beyond * d1,
-        after_b * q1 + to_f * q2 + beyond * d2,
-        after_c * q2 + beyond * d3,
-        d0,
-        d1,
-        d2,
-        d3,
-    )
+    return b_splines(a, b, c, d, e, f, u, low, high)
 
 
 @triton.jit
@@ -66,11 +49,7 @@ def _second_derivatives(around, u, low, high):
     """Return the second derivatives of the four; zero beyond the ends."""
     a, b, c = tl.load(around + 1), tl.load(around + 2), tl.load(around + 3)
     d, e, f = tl.load(around + 4), tl.load(around + 5), tl.load(around + 6)
-    scale = tl.where((u < low) | (u > high), 0.0, 6.0 + tl.zeros_like(u))
-    width = divide(1.0, d - c)
-    p0, p1 = divide((d - u) * width, d - b), divide((u - c) * width, e - c)
-    r0, r1, r2 = divide(-p0, d - a), divide(p0 - p1, e - b), divide(p1, f - c)
-    return -scale * r0, scale * (r0 - r1), scale * (r1 - r2), scale * r2
+    return b_splines_second(a, b, c, d, e, f, u, low, high)
 
 
 @triton.jit

@@ -7,6 +7,7 @@ and four numbers (value, slopes, twist) of each node, by rows.
 import triton
 import triton.language as tl
 
+from dolens.kernels import cubics
 from dolens.kernels.cuda.arithmetic import divide
 from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, DEGREE, SHAPE
@@ -15,9 +16,11 @@ from dolens.kernels.cuda.shapes import (
     even_asphere_sag,
     even_asphere_sums,
 )
+from dolens.kernels.cuda.translation import compiled
 
 OWN = tl.constexpr(int(SHAPE) + 3)  # where there are no even coefficients but a2
 NODES = tl.constexpr(4)
+basis, second_derivatives = compiled(cubics.hermite), compiled(cubics.hermite_second)
 
 
 @triton.jit
@@ -31,35 +34,6 @@ def _place(u, spacing, count):
     first = tl.where(first < 0, 0, first)
     first = tl.where(first > count - 2, count - 2, first)
     return first, place - first.to(u.dtype)
-
-
-@triton.jit
-def _basis(t, spacing):
-    """Return weights of value and slope at both nodes, and their derivatives."""
-    held = tl.where(t < 0.0, 0.0, tl.where(t > 1.0, 1.0, t))
-    past = (t - held) * spacing
-    s = 1.0 - held
-    bell = divide(6.0 * held * s, spacing + tl.zeros_like(t))
-    d1, d3 = s * (s - 2.0 * held), held * (held - 2.0 * s)
-    return (
-        s * s * (1.0 + 2.0 * held) - past * bell,
-        held * s * s * spacing + past * d1,
-        held * held * (1.0 + 2.0 * s) + past * bell,
-        past * d3 - held * held * s * spacing,
-        -bell,
-        d1,
-        bell,
-        d3,
-    )
-
-
-@triton.jit
-def _second_derivatives(t, spacing):
-    """Return the second derivatives of the four weights; zero beyond the grid."""
-    inside = tl.where((t < 0.0) | (t > 1.0), 0.0, 1.0)
-    inverse = divide(inside, spacing + tl.zeros_like(t))
-    bend = divide(6.0 * (2.0 * t - 1.0) * inverse, spacing + tl.zeros_like(t))
-    return bend, (6.0 * t - 4.0) * inverse, -bend, (6.0 * t - 2.0) * inverse
 
 
 @triton.jit
@@ -82,7 +56,7 @@ def grid_sag(record, codes, extras, x, y):
     """Return sag, slopes, and a margin that is positive on the conic and on the grid."""
     sag, sx, sy, margin = even_asphere_sag(record, codes, extras, x, y)
     node, step, across, along, width, height, edge = _grid(record, codes, x, y)
-    bx, by = _basis(across, width), _basis(along, height)
+    bx, by = basis(across, width), basis(along, height)
     for j in tl.static_range(2):
         for k in tl.static_range(2):
             at = node + j * step + 4 * k
@@ -103,8 +77,8 @@ def grid_hessian(record, codes, extras, x, y):
     """Return slopes and second derivatives."""
     sx, sy, sxx, sxy, syy = even_asphere_hessian(record, codes, extras, x, y)
     node, step, across, along, width, height, _ = _grid(record, codes, x, y)
-    bx, by = _basis(across, width), _basis(along, height)
-    ex, ey = _second_derivatives(across, width), _second_derivatives(along, height)
+    bx, by = basis(across, width), basis(along, height)
+    ex, ey = second_derivatives(across, width), second_derivatives(along, height)
     for j in tl.static_range(2):
         for k in tl.static_range(2):
             at = node + j * step + 4 * k

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_keys
+from dolens.kernels.cubics import b_splines, b_splines_second
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, by_names, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
@@ -252,16 +253,12 @@ def check_knots(knots: Sequence[float], count: int, name: str) -> None:
 
 
 def cubic_basis(knots: Tensor, u: Tensor, second: bool = False) -> CubicBasis:
-    """Evaluate the four cubic B-splines that are not zero at u, by Cox's and de Boor's recurrence.
+    """Evaluate the four cubic B-splines that are not zero at u; see `kernels.cubics.b_splines`.
 
-    On its own span, t_i ≤ u < t_(i+1) with t_i < t_(i+1), every denominator of the recurrence
-    spans at least that interval, so the 0/0 of repeated knots never arises.  The derivative shares
-    its terms: N' = 3(Q_k/d_k - Q_(k+1)/d_(k+1)) with the quadratic B-splines Q (de Boor, A
-    Practical Guide to Splines, ch. X).  The cost does not depend on the number of knots, except
-    for the bisection that finds the span.
-
-    Beyond an end e each function goes on along its tangent, N(e) + (u - e)·N'(e); at the end
-    itself all derivatives are those inside.
+    On its own span, t_i ≤ u < t_(i+1) with t_i < t_(i+1), the 0/0 of repeated knots never arises.
+    The cost does not depend on the number of knots, except for the bisection that finds the span.
+    Beyond an end each function goes on along its tangent; at the end itself all derivatives are
+    those inside.
 
     Args:
         knots: (n + 4,), mm; nothing differentiates with respect to them.
@@ -270,36 +267,12 @@ def cubic_basis(knots: Tensor, u: Tensor, second: bool = False) -> CubicBasis:
     """
     knots = knots.detach()
     count = knots.shape[-1] - 4
-    # Not by clamp, which halves the derivative at the ends.
     low, high = knots[3], knots[count]
-    inside = torch.where(u < low, low, torch.where(u > high, high, u))
-    beyond = u - inside
     first = torch.searchsorted(knots[4:count].contiguous(), u.detach().contiguous(), right=True)
     around = first + torch.arange(1, 7, device=u.device).view(6, *[1] * u.dim())
     # The knots t_(i-2) ... t_(i+3) about the span [t_i, t_(i+1)].
-    a, b, c, d, e, f = knots.index_select(0, around.reshape(-1)).reshape(around.shape).unbind()
-    after_a, after_b, after_c = inside - a, inside - b, inside - c
-    to_d, to_e, to_f = d - inside, e - inside, f - inside
-    # Linear, quadratic and cubic B-splines; p and q are over the widths of their own supports.
-    span = 1.0 / (d - c)
-    p0, p1 = to_d * span / (d - b), after_c * span / (e - c)
-    q0 = to_d * p0 / (d - a)
-    q1 = torch.addcmul(after_b * p0, to_e, p1) / (e - b)
-    q2 = after_c * p1 / (f - c)
-    value = torch.stack(
-        (
-            to_d * q0,
-            torch.addcmul(after_a * q0, to_e, q1),
-            torch.addcmul(after_b * q1, to_f, q2),
-            after_c * q2,
-        )
-    )
-    slope = 3.0 * torch.stack((-q0, q0 - q1, q1 - q2, q2))
-    second_derivative = None
-    if second:
-        r0, r1, r2 = -p0 / (d - a), (p0 - p1) / (e - b), p1 / (f - c)
-        second_derivative = 6.0 * torch.stack((-r0, r0 - r1, r1 - r2, r2))
-        second_derivative = torch.where(
-            beyond == 0.0, second_derivative, torch.zeros_like(second_derivative)
-        )
-    return CubicBasis(first, torch.addcmul(value, beyond, slope), slope, second_derivative)
+    six = knots.index_select(0, around.reshape(-1)).reshape(around.shape).unbind()
+    span = (*six, u, low, high)
+    numbers = b_splines(*span)
+    second_derivative = torch.stack(b_splines_second(*span)) if second else None
+    return CubicBasis(first, torch.stack(numbers[:4]), torch.stack(numbers[4:]), second_derivative)

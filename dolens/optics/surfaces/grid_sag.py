@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.cubics import hermite
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
@@ -204,29 +205,8 @@ def cell_of(u: Tensor, spacing: Tensor, count: int) -> Cell:
     first = place.detach().floor().clamp(0, count - 2)
     first = torch.where(first == first, first, torch.zeros_like(first))
     # Beyond the grid the outermost cell goes on straight: along its tangent at the edge.
-    t = place - first
-    inside = torch.where(t < 0.0, torch.zeros_like(t), torch.where(t > 1.0, torch.ones_like(t), t))
-    beyond = t - inside
-    s = 1.0 - inside
-    value = (
-        s * s * (1.0 + 2.0 * inside),
-        inside * s * s * spacing,
-        inside * inside * (1.0 + 2.0 * s),
-        -inside * inside * s * spacing,
-    )
-    bell = 6.0 * inside * s
-    slope = (
-        -bell / spacing,
-        s * (s - 2.0 * inside),
-        bell / spacing,
-        inside * (inside - 2.0 * s),
-    )
-    past = beyond * spacing
-    return Cell(
-        first.long(),
-        tuple(v + past * d for v, d in zip(value, slope, strict=True)),
-        slope,
-    )
+    numbers = hermite(place - first, spacing)
+    return Cell(first.long(), numbers[:4], numbers[4:])
 
 
 def bicubic(
