@@ -33,6 +33,8 @@ lens.first_order(), lens.seidel(10.0)
 # A lens in the terminal needs no drawing and no page, and aiming a ray no compiler of PyTorch's.
 from dolens.lens_page.overview import lens_overview, prepared_lens
 lens.chief_ray((0.0, 10.0))
+# Nor does the power of a freeform surface, which is a derivative.
+dolens.load_lens("conf/lens/freeform_corrector.yaml").first_order(meridian="y")
 assert not loaded("sympy", "torch._dynamo", "matplotlib", "jinja2")
 assert not loaded("dolens.prescriptions.zemax", "dolens.prescriptions.codev")
 # Nor do elements of glass.

@@ -328,9 +328,7 @@ def transfer_functions(
         (W, Q), complex, 1 at zero; and the same without aberrations.
     """
     count = pupil.amplitude.shape[-1]
-    from scipy.fft import next_fast_len  # slow to load, and plotting loads this module
-
-    size = next_fast_len(2 * count)
+    size = fast_length(2 * count)
     steps = pupil.cosines[..., 1] - pupil.cosines[..., 0]
     # A cell that passes a share c has amplitude c, but flux c and not c²: the autocorrelation at
     # zero, the mean of its transform, lacks the difference.
@@ -348,6 +346,21 @@ def transfer_functions(
     beyond = (frequencies * wave[:, None]).abs() >= (step * count)[:, None]
     found, perfect = found.masked_fill(beyond[:, None], 0.0).unbind(1)
     return found, perfect
+
+
+def fast_length(count: int) -> int:
+    """Return the smallest number, from a count on, whose prime factors are 11 or less.
+
+    It is SciPy's `next_fast_len`, whose import takes longer than the transforms of a lens.
+    """
+    while True:
+        left = count
+        for prime in (2, 3, 5, 7, 11):
+            while left % prime == 0:
+                left //= prime
+        if left == 1:
+            return count
+        count += 1
 
 
 def _line_spreads(pupil: RegularPupil, axis: int, size: int) -> Tensor:

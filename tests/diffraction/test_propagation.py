@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.fft import next_fast_len
 from scipy.integrate import quad, simpson
 from scipy.special import j0, j1, jn_zeros
 
 from dolens import Lens
 from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.field_pupil import fast_length
 from dolens.diffraction.propagation import direct_field, fourier_field
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.reference_sphere import path_beyond
@@ -336,3 +338,7 @@ def test_single_precision_sums_keep_the_phases():
     single = fourier_field(pupil, x, x, torch.float32).abs().square().detach()
     assert single.dtype == torch.float32
     assert float((single - double).abs().max() / double.max()) < 1e-5
+
+
+def test_lengths_of_transforms_are_scipys():
+    assert [fast_length(n) for n in range(1, 4097)] == [next_fast_len(n) for n in range(1, 4097)]

@@ -17,6 +17,7 @@ from dolens.errors import InputError
 from dolens.kernels.shapes import TABLE, Shape
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import GRAZING, Code
+from dolens.optics.autograd import is_transformed
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
@@ -434,7 +435,25 @@ class Surface(nn.Module):
 
 def _derivative(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Return the derivative of an elementwise function, in reverse mode: it may be nested."""
-    return lambda r: torch.func.vjp(function, r)[1](torch.ones_like(r))[0]
+
+    def derivative(r: Tensor) -> Tensor:
+        if is_transformed():
+            return torch.func.vjp(function, r)[1](torch.ones_like(r))[0]
+        # Outside of transforms not by them: their first use imports PyTorch's compiler, 2 seconds;
+        # and a derivative of anything but a sum imports SymPy.
+        graph = torch.is_grad_enabled()
+        with torch.enable_grad():
+            at = r if r.requires_grad else r.detach().requires_grad_()
+            value = function(at)
+            if not value.requires_grad:
+                return torch.zeros_like(r)
+            (slope,) = torch.autograd.grad(
+                value.sum(), at, create_graph=True, materialize_grads=True
+            )
+        # The graph leads to `at` anyway: it is kept where it leads further.
+        return slope if graph and function(r).requires_grad else slope.detach()
+
+    return derivative
 
 
 def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) -> Tensor:
