@@ -37,7 +37,16 @@ _VIEWS = (
         "mtf",
         "psf",
     ),
-    *("ray_fans", "relative_illumination", "rms", "spots", "strehl", "summary", "wavefront"),
+    *(
+        "optimize",
+        "ray_fans",
+        "relative_illumination",
+        "rms",
+        "spots",
+        "strehl",
+        "summary",
+        "wavefront",
+    ),
     "zernike",
 )
 LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))

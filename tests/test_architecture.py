@@ -37,7 +37,7 @@ ALLOWED = {
     },
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
-    "views": {"errors", "optics", "analysis", "diffraction", "plotting"},
+    "views": {"errors", "optics", "analysis", "diffraction", "plotting", "optimize"},
     # A page about a lens shows what all of these find out.
     "lens_page": {
         *("errors", "files", "html", "optics", "prescriptions", "analysis", "diffraction"),

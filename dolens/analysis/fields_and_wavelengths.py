@@ -50,9 +50,13 @@ def as_wavelengths(wavelengths: float | Sequence[float] | Tensor) -> Tensor:
     Raises:
         InputError: none, or one that no light has; see `require_wavelengths`.
     """
-    waves = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu().reshape(-1)
+    message = f"wavelengths must be numbers (nm), at least one, not {wavelengths}"
+    try:
+        waves = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu().reshape(-1)
+    except (TypeError, ValueError):
+        raise InputError(message) from None
     if len(waves) == 0:
-        raise InputError(f"wavelengths must be numbers (nm), at least one, not {wavelengths}")
+        raise InputError(message)
     require_wavelengths(waves.tolist())
     return waves
 

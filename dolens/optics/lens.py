@@ -129,6 +129,8 @@ class Lens(LensRays, InStates, nn.Module):
         self.telecentric_object = given.telecentric_object
         # A sentence where the stop is smaller than the aperture that its prescription asks for.
         self.stop_note = ""
+        # What `optimize` did to make this lens; None of any other.
+        self.optimization: Any = None
         check_choice(backend, BACKENDS, "backend")
         self.backend = backend
         self.materials = tuple(materials)

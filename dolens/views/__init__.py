@@ -9,11 +9,12 @@ belongs to nobody else: pyplot does not know it.
 The numbers behind each figure come from the functions that the methods call.
 """
 
+from dolens.views.design import DesignViews
 from dolens.views.image_quality import ImageQualityViews
 from dolens.views.overview import OverviewViews
 
 
-class LensViews(OverviewViews, ImageQualityViews):
+class LensViews(OverviewViews, ImageQualityViews, DesignViews):
     """Methods of `Lens` that show it.
 
     Arguments that all of them share:

@@ -24,7 +24,6 @@ from dolens.experiments.design.states import (
     entrance_pupils,
     fit_edges,
     foci,
-    refuse_lost_light,
     set_entrance_pupils,
     set_foci,
     spot_metrics,
@@ -35,6 +34,7 @@ from dolens.experiments.settings import check_positive
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
+from dolens.optimize.rounds import refuse_lost_light
 from dolens.optimize.states import StatesMerit, StatesValue
 from dolens.optimize.variables import start_values
 from dolens.prescriptions import lens_from_prescription

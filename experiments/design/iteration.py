@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.experiments.design.states import spot_labels
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritFunction
 from dolens.optimize.linear_least_squares import LinearModel
 from dolens.optimize.merit import MeritValue
+from dolens.optimize.rounds import spot_labels
 from dolens.optimize.states import StatesMerit, StatesValue
 
 # How often a step of a gradient that makes rays fail is halved before it is taken back.

@@ -8,14 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
 from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
 from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters, rim_rays
-from dolens.optimize.image_quality import ImageQuality
+from dolens.optimize.rounds import spot_labels
 
 logger = logging.getLogger(__name__)
 
@@ -85,12 +83,6 @@ def spot_metrics(
         ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
     )
     return numbers
-
-
-def spot_labels(spots: SpotRays) -> list[str]:
-    """Return the label of every spot, as `x,y/588nm`."""
-    fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
-    return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
 
 
 def _doubled(settings: MeritSettings) -> dict[str, Any]:
@@ -286,25 +278,3 @@ def fit_edges(lens: Lens, initial: Lens | None, settings: MeritSettings) -> None
         edges[state] = fitted_semi_diameters(there, own, _BESIDE)
         edges[state].pop(str(lens.stop), None)
     set_edges(lens, edges)
-
-
-def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:
-    """Check that no spot has lost too much light since a search began.
-
-    Each round takes its rays from the lens as it then is, so that every one could lose some.
-
-    Args:
-        quality: that of the present round.
-        initial_light: (S,), the light of its spots when the search began; see `SpotRays.light`.
-
-    Raises:
-        InputError: a spot has lost more than `max_vignetting` of its light.
-    """
-    least = initial_light * (1.0 - quality.max_vignetting)
-    lost = quality.spots.light < least.to(quality.spots.light)
-    if bool(lost.any()):
-        label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
-        raise InputError(
-            f"spot {label} has lost more than merit.max_vignetting = "
-            f"{quality.max_vignetting:g} of the light that it had at first"
-        )

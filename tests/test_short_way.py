@@ -1,0 +1,142 @@
+"""The short way in Python: what one call gives is what the commands give, and examples are true."""
+
+import copy
+import doctest
+
+import pytest
+import torch
+
+import dolens
+from dolens import InputError, load_lens
+from dolens.optics import LENS_METHODS
+from dolens.optics.lens import Lens
+from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
+
+
+def examples():
+    """Doctests of the methods of `Lens` and of the functions of `dolens`, by name."""
+    found = {name: getattr(Lens, name) for name in LENS_METHODS}
+    found |= {name: getattr(dolens, name) for name in dolens.__all__}
+    for name, each in found.items():
+        for test in doctest.DocTestFinder(recurse=False).find(each, name, globs={"dolens": dolens}):
+            if test.examples:
+                yield pytest.param(test, id=name)
+
+
+@pytest.mark.parametrize("test", list(examples()))
+def test_the_example_of_a_docstring_is_true(test):
+    said = []
+    done = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(
+        test, out=said.append
+    )
+    assert done.attempted and not done.failed, "".join(said)
+
+
+# ---------------------------------------------------------------- optimize
+
+NIKON = (
+    *("surfaces.[1-9].curvature", "surfaces.1[013-9].curvature", "surfaces.20.curvature"),
+    *("surfaces.1[78].conic", "surfaces.1[78].a4"),
+)
+KEPT = {"efl": 1.5736, "edge_thickness": (0.03, None), "edge_air_gap": (0.005, None)}
+
+
+def nikon_from_spheres():
+    lens = load_lens("nikon", index_model="do")
+    with torch.no_grad():
+        for parameter in lens.variables(["surfaces.1[78].a*", "surfaces.1[78].conic"]).values():
+            parameter.zero_()
+    return lens
+
+
+def test_one_call_reaches_the_merit_of_the_experiment_of_the_same_settings():
+    """As conf/experiment/nikon.yaml has them: six iterations by hand, and by `optimize`."""
+    lens = nikon_from_spheres()
+    before = copy.deepcopy(lens.state_dict())
+    better = lens.optimize(NIKON, keep=KEPT, iterations=6, sampling="square_grid")
+    operands = [
+        {"kind": "efl", "target": 1.5736, "weight": 100.0},
+        {"kind": "edge_thickness", "min": 0.03, "weight": 100.0},
+        {"kind": "edge_air_gap", "min": 0.005, "weight": 100.0},
+    ]
+    settings = MeritSettings(sampling="square_grid", operands=operands)
+    variables = DesignVariables(lens, dict.fromkeys(NIKON))
+    merit = settings.build(lens, variables)
+    optimizer = DampedLeastSquares([variables.parameter_group()], merit_tolerance=1e-9)
+    by_hand = [merit().sum_of_squares(), *(float(optimizer.step(merit)) for _ in range(6))]
+    record = better.optimization
+    assert record.merit == tuple(by_hand)
+    assert all(torch.equal(value, before[name]) for name, value in lens.state_dict().items())
+    assert lens.optimization is None
+    # What is kept of the rounds is the merit over the rays that pass the lens that was found.
+    variables.write_to(lens)
+    assert record.reached == settings.build(lens, variables)().sum_of_squares()
+    for name, value in variables.file_values().items():
+        assert better.get_parameter(name).item() == value
+
+
+def test_a_singlet_is_bent_to_its_least_spherical_aberration():
+    """Coddington's shape factor 2(n² - 1)/(n + 2) of a thin lens, for an object at infinity."""
+    lens = dolens.load_lens("lb1757")
+    with torch.no_grad():
+        lens.thicknesses["1"].fill_(0.1)
+        lens.surfaces["1"].curvature.fill_(0.02)
+        lens.surfaces["2"].curvature.fill_(-0.02)
+    focal = float(lens.first_order(587.5618).efl)
+    better = lens.optimize(
+        {"surfaces.*.curvature": None, "sensor_distance": {"solve": "best_focus"}},
+        keep={"efl": {"target": focal, "weight": 1e4}},
+        fields=0.0,
+        wavelengths=587.5618,
+        sampling_options={"rings": 6},
+        max_vignetting=1.0,
+    )
+    first, second = (float(better.surfaces[n].curvature) for n in "12")
+    index = float(lens.materials[1].index(torch.tensor(587.5618, dtype=torch.float64)))
+    shape = (first + second) / (first - second)
+    assert shape == pytest.approx(2.0 * (index**2 - 1.0) / (index + 2.0), rel=0.03)
+    assert float(better.first_order(587.5618).efl) == pytest.approx(focal, rel=1e-4)
+
+
+def test_a_record_shows_operands_bounds_and_what_nothing_kept():
+    lens = load_lens("cooke_triplet")
+    better = lens.optimize(
+        {"surfaces.*.curvature": None, "thicknesses.*": {"lower": 1.0, "upper": 6.5}},
+        keep={"efl": 50, "back_focus": (30, None), "distortion": (-2, 2)},
+        iterations=20,
+    )
+    record = better.optimization
+    assert "thicknesses.3" in record.at_bounds
+    kept = {one.label: one for one in record.operands}
+    assert set(kept) == {"efl", "bfd", "distortion/0,20"}
+    assert kept["efl"].after == pytest.approx(float(better.first_order().efl))
+    assert kept["bfd"].deviation == 0.0 and kept["bfd"].wanted == "at least 30"
+    text, page = repr(record), record._repr_html_()
+    for part in ("Cooke triplet: RMS spot radius", "at its bound 1", "at least 30", "-2 to 2"):
+        assert part.replace("-", "−") in page.replace("-", "−") and part in text
+    assert record.figure()._repr_png_() and record.draw()._repr_png_()
+    assert copy.deepcopy(better).optimization is record
+    thin = lens.optimize(["thicknesses.3"], keep={"total_track": 57.0}, iterations=10)
+    assert thin.optimization.notes[0].startswith("centre_thickness/3 is -")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"variables": []}, "variables: there are none"),
+        ({"variables": ["surface.*.curvature"]}, "has no parameter 'surface"),
+        ({"variables": 3}, r"variables: 3; allowed: names or patterns"),
+        ({"for_": "spot"}, "for_: 'spot' is unknown; did you mean 'spots'"),
+        ({"keep": {"elf": 50}}, "keep: 'elf' is unknown; did you mean 'efl'"),
+        ({"keep": {"efl": "50mm"}}, "keep: efl: '50mm'; allowed: a number"),
+        ({"keep": {"efl": (60, 50)}}, "keep: operand 'efl': min exceeds max"),
+        ({"keep": {"bfd": 40, "back_focus": 40}}, "keep: 'back_focus' is named twice"),
+        ({"iterations": 0}, "iterations: 0; allowed: an integer of 1 or more"),
+        ({"field": 3}, r"optimize\(\): unknown key 'field'; did you mean 'fields'"),
+        ({"wavelengths": "red"}, "wavelengths must be numbers"),
+    ],
+)
+def test_what_cannot_be_optimized_is_refused_in_one_line(given, message):
+    lens = load_lens("cooke_triplet")
+    with pytest.raises(InputError, match=message):
+        lens.optimize(**{"variables": ["surfaces.1.curvature"], **given})
