@@ -25,7 +25,7 @@ _HOMES = {
     "register_surface": "dolens.optics.surfaces",
     "save_lens": "dolens.prescriptions",
 }
-_PACKAGES = ("kernels", "optics", "prescriptions")
+_PACKAGES = ("kernels", "optics", "optimize", "prescriptions")
 _VIEWS = (
     *(
         "draw",
@@ -65,4 +65,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Return the public names, loaded or not."""
-    return sorted({*globals(), *__all__, *_PACKAGES})
+    return sorted({*__all__, *_PACKAGES, "__version__"})
