@@ -42,7 +42,10 @@ import dolens.manufacturing.glass_elements
 assert not loaded("dolens.plotting", "matplotlib")
 from dolens.plotting import layout_figure
 layout_figure(lens)
-assert not loaded("numba")
+# A draft waits for no kernels, and an MTF for no SciPy.
+triplet = dolens.load_lens("cooke_triplet")
+triplet.spots(draft=True), triplet.mtf(draft=True)
+assert not loaded("numba", "scipy", "torch._dynamo", "sympy")
 
 # A lens on the CPU loads no kernels for GPUs.
 lens = dolens.load_lens("conf/lens/asphere.yaml", backend="cpu")

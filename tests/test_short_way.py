@@ -2,6 +2,7 @@
 
 import copy
 import doctest
+import re
 
 import pytest
 import torch
@@ -140,3 +141,49 @@ def test_what_cannot_be_optimized_is_refused_in_one_line(given, message):
     lens = load_lens("cooke_triplet")
     with pytest.raises(InputError, match=message):
         lens.optimize(**{"variables": ["surfaces.1.curvature"], **given})
+
+
+# ---------------------------------------------------------------- drafts
+
+
+def curves(figure):
+    """Contrast of the panel with diffraction, or of the only one: label → values."""
+    return {
+        line.get_label().replace(" (rays alone)", ""): torch.tensor(line.get_ydata())
+        for line in figure.axes[0].lines
+    }
+
+
+def radii(figure):
+    """RMS radii in the headings of a spot diagram, µm."""
+    headings = [axes.get_title() for axes in figure.axes]
+    return torch.tensor([float(re.search(r"RMS ([\d.]+)", text)[1]) for text in headings])
+
+
+# Of the triplet all fields diffract; of the others' rays take the place of diffraction.
+@pytest.mark.parametrize(
+    ("name", "of_contrast", "of_radius"),
+    [("cooke_triplet", 1e-9, 6e-3), ("double_gauss", 0.025, 0.03), ("lb1757", 0.025, 0.03)],
+)
+def test_a_draft_is_as_close_to_the_exact_figure_as_its_docstring_says(
+    name, of_contrast, of_radius
+):
+    lens = load_lens(name)
+    for what, most in (({"geometric": False}, of_contrast), ({"diffraction": False}, 0.05)):
+        exact, draft = (curves(lens.mtf(draft=how, **what)) for how in (False, True))
+        assert exact.keys() == draft.keys() and len(exact) > 3
+        for label, curve in exact.items():
+            assert float((curve - draft[label]).abs().max()) <= most
+    exact, draft = radii(lens.spots()), radii(lens.spots(draft=True))
+    assert float((draft / exact - 1.0).abs().max()) <= of_radius
+    assert lens.backend == "auto"
+
+
+@pytest.mark.parametrize("method", ["spots", "mtf"])
+def test_a_figure_says_whether_it_is_a_draft(method):
+    lens = load_lens("cooke_triplet")
+    for draft in (False, True):
+        figure = getattr(lens, method)(draft=draft)
+        assert figure.draft is draft and ("(draft)" in figure.get_suptitle()) is draft
+    with pytest.raises(InputError, match=r"draft: True with kind 'huygens'; allowed: .*'fourier'"):
+        lens.mtf(kind="huygens", draft=True)

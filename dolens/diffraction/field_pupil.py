@@ -66,6 +66,7 @@ class FieldPupil:
         front: Wavefront,
         weights: Tensor,
         most_samples: int,
+        most_rays: int = _RAYS,
     ) -> "FieldPupil":
         """Choose how light is propagated, by wavefronts of 32 rays a side or more.
 
@@ -75,6 +76,7 @@ class FieldPupil:
             front: W wavefronts.
             weights: (W,).
             most_samples: across the pupil, beyond which rays alone are used.
+            most_rays: of these, along each side of the beam.
         """
         fit = fit_pupil(front, _DEGREES[0])
         if not bool((fit.residual <= _RESIDUAL).all()):
@@ -84,7 +86,7 @@ class FieldPupil:
         if not reason:
             return replace(found, reason="Fourier transform of the pupil")
         # An infinite sphere is met by all rays, however far they land from its centre.
-        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS, math.inf)
+        rays = pupil_wavefront(system, point, front.wavelength, front.centre, most_rays, math.inf)
         return cls(rays, weights, None, f"rays alone: {reason}")
 
     @property

@@ -104,6 +104,8 @@ def object_points(fields: Tensor, object_distance: float | None) -> ObjectPoints
 
 # Samples across the pupil beyond which rays alone make the image: a spot of some 70 Airy radii.
 _MOST_SAMPLES = 512
+# Of a draft: such samples, and rays along each side of a beam where rays alone make the image.
+_DRAFT_SAMPLES, _DRAFT_RAYS = 384, 128
 
 
 @dataclass(frozen=True)
@@ -121,20 +123,25 @@ class PreparedPupils:
 
 @torch.no_grad()
 def prepare_pupils(
-    lens: Lens, where: Conditions, most_samples: int = _MOST_SAMPLES
+    lens: Lens, where: Conditions, most_samples: int = _MOST_SAMPLES, draft: bool = False
 ) -> PreparedPupils:
     """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
 
-    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    Wavefronts that need more samples across the pupil than `most_samples` are left to rays; of a
+    draft those that need more than 384 are, and the rays are fewer.
     """
     found = field_wavefronts(lens, where.that_count())
-    return PreparedPupils(found, _field_pupils(lens, found, most_samples))
+    settings = (min(most_samples, _DRAFT_SAMPLES), _DRAFT_RAYS) if draft else (most_samples,)
+    return PreparedPupils(found, _field_pupils(lens, found, *settings))
 
 
-def _field_pupils(lens: Lens, found: FieldWavefronts, most_samples: int) -> list[FieldPupil | None]:
+def _field_pupils(lens: Lens, found: FieldWavefronts, *settings: int) -> list[FieldPupil | None]:
     """Return the pupils of every field, None for a field without light.
 
-    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    Args:
+        lens: the lens.
+        found: its wavefronts.
+        settings: the last arguments of `FieldPupil.of`.
     """
     system = lens.system().double()
     where = found.where
@@ -149,7 +156,7 @@ def _field_pupils(lens: Lens, found: FieldWavefronts, most_samples: int) -> list
         field = where.fields[number].to(system.device).expand(count, 2)
         point = object_points(field, where.object_distance)
         front = part_of(found.wavefront, which)
-        pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
+        pupils.append(FieldPupil.of(system, point, front, weights, *settings))
     return pupils
 
 

@@ -33,7 +33,8 @@ class DiffractionModulation(AtConditions):
         reasons: why, of each.
         sampling_error: (F,), the largest change of either curve by a second computation with half
             of the pupil's samples (or half of the rays, where these alone are used); NaN where no
-            light passes.
+            light passes, and of a draft.
+        draft: whether it is a draft; see `diffraction_modulation`.
     """
 
     frequencies: Tensor
@@ -44,6 +45,7 @@ class DiffractionModulation(AtConditions):
     diffraction: tuple[bool, ...]
     reasons: tuple[str, ...]
     sampling_error: Tensor
+    draft: bool = False
 
 
 @torch.no_grad()
@@ -52,6 +54,7 @@ def diffraction_modulation(
     where: Conditions,
     frequencies: Sequence[float] | Tensor,
     prepared: PreparedPupils | None = None,
+    draft: bool = False,
 ) -> DiffractionModulation:
     """Compute the polychromatic MTF with diffraction.
 
@@ -65,8 +68,10 @@ def diffraction_modulation(
 
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+        draft: leave out the second computation, which knows the sampling error, and leave spots of
+            more than some 50 Airy radii to 128 × 128 rays.
     """
-    prepared = prepared or prepare_pupils(lens, where, _MOST_SAMPLES)
+    prepared = prepared or prepare_pupils(lens, where, _MOST_SAMPLES, draft)
     found, pupils = prepared.wavefronts, prepared.pupils
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
@@ -78,8 +83,11 @@ def diffraction_modulation(
             errors.append(math.nan)
             continue
         found_here, limit = pupil.transfer(frequency, way)
-        coarser, _ = pupil.transfer(frequency, way, COARSER)
         rows.append(torch.cat([found_here.abs(), limit]))
+        if draft:
+            errors.append(math.nan)
+            continue
+        coarser, _ = pupil.transfer(frequency, way, COARSER)
         errors.append(float((found_here.abs() - coarser.abs()).abs().amax()))
     tangential, sagittal, *limits = torch.stack(rows, 1).cpu()
     return DiffractionModulation(
@@ -92,4 +100,5 @@ def diffraction_modulation(
         tuple(pupil is not None and pupil.diffraction for pupil in pupils),
         tuple("no light passes" if pupil is None else pupil.reason for pupil in pupils),
         torch.tensor(errors, dtype=torch.float64),
+        draft,
     )

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from dolens.errors import check_choice
-from dolens.views.overview import as_lens, looked_at, shown, title_of
+from dolens.errors import InputError, check_choice
+from dolens.views.overview import as_lens, looked_at, shown, title_of, traced_at_once
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from dolens.views.overview import Wavelengths
 
 KINDS = ("fourier", "huygens")
+# Of a draft: rays of each spot, in a spot diagram and for the MTF of rays.
+_DRAFT_SPOT, _DRAFT_MTF = 1000, 2000
 
 
 class ImageQualityViews:
@@ -34,9 +36,21 @@ class ImageQualityViews:
         object_distance: float | None = None,
         rays: int = 2000,
         overlaid: bool = True,
+        draft: bool = False,
         **aperture: float,
     ) -> Figure:
         """Plot spot diagrams; the numbers are those of `analysis.spot_diagram.spot_diagram`.
+
+        A draft has 1000 rays a spot at most, and a small lens is traced without kernels: the first
+        call waits for none to be loaded or compiled.  Over the lenses of conf/lens RMS radii of all
+        wavelengths were off by 0.5 % or less, and by 1 to 3 % at fields that lose much of their
+        light to other apertures than the stop; those of one wavelength there by up to 8 %.
+
+        Example:
+            >>> import dolens
+            >>> figure = dolens.load_lens("cooke_triplet").spots(draft=True)
+            >>> figure.draft, figure.get_suptitle().split(":")[0]
+            (True, 'Spot diagram (draft)')
 
         Args:
             fields: see the class, as the other arguments that are not named here.
@@ -44,14 +58,18 @@ class ImageQualityViews:
             object_distance: see the class.
             rays: of each spot, a multiple of four.
             overlaid: one panel a field; else one for every field and wavelength.
+            draft: see above; the figure's title and its attribute `draft` say so.
             aperture: see the class.
         """
         from dolens.analysis.spot_diagram import spot_diagram
         from dolens.plotting.spots_and_ray_fans import spots_figure
 
         lens, given = looked_at(self.spots, fields, wavelengths, object_distance, aperture)
+        if draft:
+            lens, rays = traced_at_once(lens, given), min(rays, _DRAFT_SPOT)
         spots = spot_diagram(lens, given, rays)
-        return shown(spots_figure(spots, overlaid, title_of("Spot diagram", lens, given)))
+        title = title_of("Spot diagram", lens, given, draft)
+        return shown(spots_figure(spots, overlaid, title), draft)
 
     def ray_fans(
         self,
@@ -76,13 +94,27 @@ class ImageQualityViews:
         diffraction: bool = True,
         geometric: bool = True,
         kind: str = "fourier",
+        draft: bool = False,
         **aperture: float,
     ) -> Figure:
         """Plot the MTF with diffraction and of rays, of all wavelengths together.
 
+        A draft leaves out the MTF of rays, unless it is asked for alone and then has 2000 rays a
+        spot, and the second computation that knows the sampling error.  Spots of more than some 50
+        Airy radii have the MTF of 128 × 128 rays.  Small lenses are traced as in a draft of
+        `spots`.  Over the lenses of conf/lens contrast was off by 0.024 or less, where rays take
+        the place of diffraction, and not at all elsewhere; that of rays alone by 0.01 or less, and
+        by 0.05 at the edge of the double Gauss lens's field.
+
         See `diffraction.modulation_transfer.diffraction_modulation`,
         `diffraction.huygens.huygens_modulation` and
         `analysis.modulation_transfer.modulation`.
+
+        Example:
+            >>> import dolens
+            >>> figure = dolens.load_lens("cooke_triplet").mtf(draft=True)
+            >>> figure.draft, len(figure.get_axes())
+            (True, 1)
 
         Args:
             fields: see the class, as the other arguments that are not named here.
@@ -92,22 +124,35 @@ class ImageQualityViews:
             diffraction: whether to plot the MTF with diffraction.
             geometric: whether to plot the MTF of rays.
             kind: of the diffraction: `fourier`, or `huygens`, which takes far longer.
+            draft: see above; the figure's title and its attribute `draft` say so.
             aperture: see the class.
+
+        Raises:
+            InputError: as the class says, or a draft of kind `huygens`.
         """
         check_choice(kind, KINDS, "kind")
+        if draft and kind == "huygens":
+            raise InputError("draft: True with kind 'huygens'; allowed: drafts of kind 'fourier'")
         from dolens.analysis.modulation_transfer import frequency_range, modulation
         from dolens.diffraction.huygens import huygens_modulation
         from dolens.diffraction.modulation_transfer import diffraction_modulation
         from dolens.plotting.modulation import modulation_comparison_figure
 
         lens, given = looked_at(self.mtf, fields, wavelengths, object_distance, aperture)
+        if draft:
+            lens = traced_at_once(lens, given)
         if frequencies is None:
             frequencies = frequency_range(lens, given)
-        by_waves = huygens_modulation if kind == "huygens" else diffraction_modulation
-        wave = by_waves(lens, given, frequencies) if diffraction else None
-        rays = modulation(lens, given, frequencies) if geometric else None
-        title = title_of("Modulation transfer function", lens, given)
-        return shown(modulation_comparison_figure(wave, rays, title))
+        wave = rays = None
+        if diffraction and kind == "huygens":
+            wave = huygens_modulation(lens, given, frequencies)
+        elif diffraction:
+            wave = diffraction_modulation(lens, given, frequencies, draft=draft)
+        if geometric and not (draft and diffraction):
+            settings = (_DRAFT_MTF,) if draft else ()
+            rays = modulation(lens, given, frequencies, *settings)
+        title = title_of("Modulation transfer function", lens, given, draft)
+        return shown(modulation_comparison_figure(wave, rays, title), draft)
 
     def encircled_energy(
         self,

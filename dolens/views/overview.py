@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from inspect import signature
 from typing import TYPE_CHECKING, Any
@@ -130,15 +131,41 @@ def looked_at(
     return lens, conditions(lens, fields, wavelengths, object_distance)
 
 
-def title_of(what: str, lens: Lens, given: Conditions) -> str:
-    """Return the title of a figure: what it shows, of which lens, and at which conditions."""
+def title_of(what: str, lens: Lens, given: Conditions, draft: bool = False) -> str:
+    """Return the title of a figure: what it shows, of which lens, at which conditions, and whether
+    it is a draft.
+    """
     from dolens.plotting.style import caption
 
-    return caption(what, lens, given)
+    return caption(f"{what} (draft)" if draft else what, lens, given)
 
 
-def shown(figure: Figure) -> Figure:
-    """Return a figure that a notebook shows, once, whether pyplot was imported or not."""
+# Fields times wavelengths times surfaces up to which a draft is traced without kernels.
+_SMALL = 80
+
+
+def traced_at_once(lens: Lens, given: Conditions) -> Lens:
+    """Return a lens for drafts: a small one without kernels, which must be loaded or compiled.
+
+    PyTorch traces it as fast as kernels do once they are there.  Which of them does depends on
+    nothing else, so that the last digits do not.
+    """
+    spots = len(given.fields) * len(given.wavelengths)
+    if lens.backend != "auto" or spots * len(lens.surfaces) > _SMALL:
+        return lens
+    found = copy.copy(lens)
+    found.backend = "reference"
+    return found
+
+
+def shown(figure: Figure, draft: bool = False) -> Figure:
+    """Return a figure that a notebook shows, once, whether pyplot was imported or not.
+
+    Args:
+        figure: of any kind.
+        draft: whether it is one; its attribute `draft` says so.
+    """
     from dolens.plotting.export import showing
 
+    figure.draft = draft  # type: ignore[attr-defined]
     return showing(figure)
