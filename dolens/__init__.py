@@ -25,7 +25,7 @@ _HOMES = {
     "register_surface": "dolens.optics.surfaces",
     "save_lens": "dolens.prescriptions",
 }
-_PACKAGES = ("kernels", "optics", "optimize", "prescriptions")
+_PACKAGES = ("kernels", "optics", "optimize", "prescriptions", "tolerancing")
 _VIEWS = (
     *(
         "draw",
@@ -50,6 +50,7 @@ _VIEWS = (
     "zernike",
 )
 LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))
+LENS_METHODS["tolerances"] = "dolens.lens_page.lens_tolerances.ToleranceMethods"
 
 
 def __getattr__(name: str) -> Any:

@@ -9,6 +9,9 @@ import torch
 
 import dolens
 from dolens import InputError, load_lens
+from dolens.analysis.conditions import conditions
+from dolens.lens_page.offenders import offenders
+from dolens.lens_page.overview import prepared_lens
 from dolens.optics import LENS_METHODS
 from dolens.optics.lens import Lens
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
@@ -83,7 +86,7 @@ def test_a_singlet_is_bent_to_its_least_spherical_aberration():
         lens.thicknesses["1"].fill_(0.1)
         lens.surfaces["1"].curvature.fill_(0.02)
         lens.surfaces["2"].curvature.fill_(-0.02)
-    focal = float(lens.first_order(587.5618).efl)
+    focal = lens.first_order(587.5618).efl.item()
     better = lens.optimize(
         {"surfaces.*.curvature": None, "sensor_distance": {"solve": "best_focus"}},
         keep={"efl": {"target": focal, "weight": 1e4}},
@@ -187,3 +190,54 @@ def test_a_figure_says_whether_it_is_a_draft(method):
         assert figure.draft is draft and ("(draft)" in figure.get_suptitle()) is draft
     with pytest.raises(InputError, match=r"draft: True with kind 'huygens'; allowed: .*'fourier'"):
         lens.mtf(kind="huygens", draft=True)
+
+
+# ---------------------------------------------------------------- tolerances
+
+
+def test_tolerances_are_those_of_the_page_and_the_yield_that_of_traced_lenses():
+    lens = load_lens("cooke_triplet")
+    made = lens.tolerances("default", lenses=400, seed=1)
+    shown = prepared_lens(lens)
+    page = offenders(shown, conditions(shown), "default")
+    assert made.table().rows == page.table().rows
+    assert made.offenders.summary() == page.summary()
+    # A lens that no drawn error has moved is the design; and the model predicts the traced mean.
+    radii = made.radii_um()
+    assert made.nominal_um == pytest.approx(1e3 * page.contributions.nominal**0.5)
+    assert float(radii.square().mean().sqrt()) == pytest.approx(made.expected_um, rel=0.02)
+    assert made.yield_at(made.radius_of(0.9)) == pytest.approx(0.9)
+    assert made.yield_at(0.0) == 0.0 and made.yield_at(1e3) == 1.0
+    again = lens.tolerances("default", lenses=400, seed=1)
+    assert torch.equal(again.radii_um(), radii)
+    text, html = repr(made), made._repr_html_()
+    assert "90 % of 400 lenses within" in text and "90 % of 400 lenses within" in html
+    assert made.figure()._repr_png_() and made.offenders_figure()._repr_png_()
+
+
+def test_half_ranges_are_given_as_a_mapping_and_a_tenth_of_them_does_a_hundredth():
+    """The average rise of the mean square radius is quadratic in the tolerances."""
+    lens = load_lens("cooke_triplet")
+    rise = [
+        found.expected_um**2 - found.nominal_um**2
+        for factor in (1.0, 0.1)
+        for found in [lens.tolerances({"elements.*.tilt_[xy]": 0.05 * factor}, lenses=10)]
+    ]
+    assert rise[1] == pytest.approx(rise[0] / 100.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tolerances": "usual"}, "^tolerances: usual: cannot be read"),
+        ({"tolerances": 3}, "tolerances: 3; allowed: 'default', a file, or pattern"),
+        ({"tolerances": {}}, "tolerances: none is given"),
+        ({"tolerances": {"thickness.*": 0.1}}, "has no parameter 'thickness"),
+        ({"lenses": 0}, "lenses: 0; allowed: an integer of 1 or more"),
+        ({"seed": 0.5}, "seed: 0.5; allowed: an integer of 0 or more"),
+        ({"fnumber": 8}, r"tolerances\(\): unknown key 'fnumber'; did you mean 'f_number'"),
+    ],
+)
+def test_what_cannot_be_toleranced_is_refused_in_one_line(given, message):
+    with pytest.raises(InputError, match=message):
+        load_lens("cooke_triplet").tolerances(**given)

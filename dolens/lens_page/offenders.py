@@ -4,15 +4,17 @@ They are those of a file (see `dolens.prescriptions.files.read_tolerance_file`),
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import Conditions
+from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.errors import InputError
 from dolens.lens_page.tables import Table, number
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
 from dolens.prescriptions.files import read_tolerance_file
@@ -31,6 +33,9 @@ from dolens.tolerancing import (
 
 DEFAULT = "default"
 _MOST = 12
+# Share of the brightest field's light that a field of tolerances has.
+_BRIGHT = 0.1
+Source = str | Path | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -62,8 +67,8 @@ class Offenders:
             },
         )
 
-    def table(self) -> Table:
-        """Return the worst offenders, one a row."""
+    def table(self, most: int = _MOST) -> Table:
+        """Return the worst offenders, one a row, and no more than so many."""
         t, c, s = self.tolerances, self.contributions, self.sensitivities
         growth, unfocused = s.increase(), s.increase(refocused=False)
         rows = [
@@ -75,7 +80,7 @@ class Offenders:
                 number(1e3 * unfocused[p], 3, zeros=True),
                 number(1e3 * s.largest_centroid_shift[p], 3, zeros=True),
             )
-            for p in c.order[:_MOST]
+            for p in c.order[:most]
         ]
         heads = ("parameter", "tolerance", "share", "RMS grows", "not refocused", "spot moves")
         return Table(
@@ -97,35 +102,20 @@ class Offenders:
         )
 
 
-def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
+def offenders(lens: Lens, where: Conditions, source: Source) -> Offenders:
     """Find the worst offenders of a lens.
 
     Args:
         lens: as designed, in double precision; it stays as it is.
         where: fields, which are taken on both sides of the axis in x and in y, and wavelengths,
             with their weights.
-        source: `default`, or a YAML file; see `read_tolerance_file`.
+        source: see `tolerances_of`.
 
     Raises:
         InputError: the file cannot be read or names what the lens does not have, or no light of
             a field passes.
     """
-    notes: list[str] = []
-    given: Mapping[str, Any]
-    if str(source) == DEFAULT:
-        lens = with_glass_elements(lens)
-        given, factor = usual_tolerances(lens), 1.0
-        notes.append(usual_tolerances_text(lens))
-    else:
-        lens, content, unread = read_tolerance_file(lens, source)
-        if "tolerances" not in content:
-            raise InputError(f"{source}: 'tolerances' is missing")
-        given, factor = content["tolerances"], content.get("tolerance_factor", 1.0)
-        name = Path(source).name
-        if unread:
-            notes.append(f"Not read from {name}: {', '.join(unread)}.")
-        notes.append(f"Tolerances of {name}.")
-    tolerances = tolerances_from(lens, given, factor)
+    lens, tolerances, notes = tolerances_of(lens, source)
     model, weights = linear_spots_over_field(lens, where, tolerances.names)
     return Offenders(
         tolerances,
@@ -133,3 +123,50 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         contributions(model, tolerances, weights),
         notes,
     )
+
+
+def tolerances_of(lens: Lens, source: Source) -> tuple[Lens, Tolerances, list[str]]:
+    """Return a copy of a lens with the elements that may tilt and move, its tolerances, and notes.
+
+    Args:
+        lens: as designed; it stays as it is.
+        source: `default`, the usual ones; a YAML file, see `read_tolerance_file`; or a mapping, see
+            `dolens.tolerancing.tolerances_from`.
+
+    Raises:
+        InputError: the file cannot be read, or names what the lens does not have.
+    """
+    given: Mapping[str, Any]
+    if isinstance(source, Mapping):
+        lens = with_glass_elements(lens)
+        return lens, tolerances_from(lens, source), []
+    if str(source) == DEFAULT:
+        lens = with_glass_elements(lens)
+        return lens, tolerances_from(lens, usual_tolerances(lens)), [usual_tolerances_text(lens)]
+    lens, content, unread = read_tolerance_file(lens, source)
+    if "tolerances" not in content:
+        raise InputError(f"{source}: 'tolerances' is missing")
+    given, factor = content["tolerances"], content.get("tolerance_factor", 1.0)
+    name = Path(source).name
+    notes = [f"Not read from {name}: {', '.join(unread)}."] if unread else []
+    return lens, tolerances_from(lens, given, factor), [*notes, f"Tolerances of {name}."]
+
+
+def bright_fields(where: Conditions, spots: SpotDiagram | None) -> tuple[Conditions, list[str]]:
+    """Return conditions without the fields of which little light passes, and a note of those.
+
+    Where little of the stop is lit, tolerances say nothing of use.
+
+    Args:
+        where: the fields.
+        spots: of them; None leaves all.
+    """
+    if spots is None:
+        return where, []
+    light = spots.valid.double().mean((1, 2))
+    bright = light >= _BRIGHT * light.max()
+    dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
+    if not dim or not bool((bright & (where.field_weights > 0.0)).any()):
+        return where, []
+    kept = replace(where, fields=where.fields[bright], field_weights=where.field_weights[bright])
+    return kept, [f"tolerances at {', '.join(dim)}: too little light passes"]

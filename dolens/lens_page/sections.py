@@ -4,7 +4,7 @@ Every section is computed alone, so that one that fails leaves the others.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from dolens.diffraction.wavefront_map import (
 )
 from dolens.errors import InputError
 from dolens.lens_page.markup import View, view
-from dolens.lens_page.offenders import offenders
+from dolens.lens_page.offenders import bright_fields, offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
 from dolens.lens_page.tables import Table, number
@@ -93,8 +93,6 @@ class Section:
 
 # Of each field and wavelength.
 _MTF_RAYS, _RMS_RAYS, _FOOTPRINT_RAYS = 6000, 2000, 400
-# Share of the brightest field's light that a field of tolerances has.
-_BRIGHT = 0.1
 
 
 class PageSections:
@@ -277,17 +275,7 @@ class PageSections:
 
     def offenders(self) -> Content:
         """Find the worst offenders among tolerances."""
-        where, problems = self.where, []
-        if self.overview.spots is not None:
-            # Where little of the stop is lit, tolerances say nothing of use.
-            light = self.overview.spots.valid.double().mean((1, 2))
-            bright = light >= _BRIGHT * light.max()
-            dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
-            if dim and bool((bright & (where.field_weights > 0.0)).any()):
-                where = replace(
-                    where, fields=where.fields[bright], field_weights=where.field_weights[bright]
-                )
-                problems.append(f"tolerances at {', '.join(dim)}: too little light passes")
+        where, problems = bright_fields(self.where, self.overview.spots)
         assert self.tolerances is not None  # there is no such section without
         found = offenders(self.lens, where, self.tolerances)
         return Content(

@@ -21,6 +21,7 @@ from dolens.tolerancing.sensitivity import (
     linear_spots_over_field,
     sensitivities,
     spot_weights,
+    spots_over_field,
 )
 from dolens.tolerancing.tolerances import (
     Tolerances,
@@ -56,9 +57,15 @@ __all__ = [
     "sensitivities",
     "share_within",
     "spot_weights",
+    "spots_over_field",
     "tolerances_from",
     "trace_perturbed",
     "usual_tolerances",
     "usual_tolerances_text",
     "with_glass_elements",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

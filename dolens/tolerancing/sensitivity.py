@@ -171,20 +171,14 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
     return LinearSpots(tuple(names), means[..., 0, 0], means[..., 1:, 0], *forms)
 
 
-def linear_spots_over_field(
-    lens: Lens, where: Conditions, names: Sequence[str]
-) -> tuple[LinearSpots, Tensor]:
-    """Return spots over the whole field as a linear function of parameters, and their weights.
+def spots_over_field(lens: Lens, where: Conditions) -> tuple[SpotRays, Tensor]:
+    """Return rays of spots over the whole field, and the weight of each spot.
 
     Fields are taken on all sides of the axis: a lens with tilted elements has no symmetry.
 
     Args:
         lens: as designed.
         where: fields and wavelengths with their weights.
-        names: of P parameters.
-
-    Returns:
-        The model, and the weight of each spot, as `spot_weights` has them.
 
     Raises:
         InputError: no light of a field passes.
@@ -197,6 +191,23 @@ def linear_spots_over_field(
     )
     spots = gaussian_quadrature(lens, points, waves, _RINGS, _ARMS, distance, symmetry=False)
     weights = spot_weights(torch.outer(where.field_weights, where.weights).flatten(), spots.count)
+    return spots, weights
+
+
+def linear_spots_over_field(
+    lens: Lens, where: Conditions, names: Sequence[str]
+) -> tuple[LinearSpots, Tensor]:
+    """Return the spots of `spots_over_field` as a linear function of parameters, and their weights.
+
+    Args:
+        lens: as designed.
+        where: fields and wavelengths with their weights.
+        names: of P parameters.
+
+    Raises:
+        InputError: no light of a field passes.
+    """
+    spots, weights = spots_over_field(lens, where)
     return linear_spots(lens, spots, names), weights
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Sequence
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.tables import Row
+from dolens.lens_page.lens_tolerances import yields_figure
 from dolens.optics.text_tables import text_table
 from dolens.plotting.style import plain_text
 from dolens.plotting.tolerances import (
@@ -15,7 +15,6 @@ from dolens.plotting.tolerances import (
     offenders_figure,
     parameter_label,
     tolerance_label,
-    yield_figure,
 )
 from dolens.tolerancing import ToleranceAnalysis, Tolerances
 
@@ -168,7 +167,7 @@ def tolerance_figures(
             spots,
             title=f"{title}\nwhat a whole tolerance does to the spots' RMS radii",
         ),
-        "yield": lambda: _yields(found, title, weights),
+        "yield": lambda: yields_figure(found, title, weights),
         "worst_offenders": lambda: offenders_figure(
             [with_tolerance[p] for p in first],
             c.share[first].tolist(),
@@ -179,27 +178,6 @@ def tolerance_figures(
             f"{title}\nworst offenders",
         ),
     }
-
-
-def _yields(found: ToleranceAnalysis, title: str, weights: Tensor) -> Figure:
-    outcomes = {
-        f"{how}, {stage}": outcome.found(stage == "refocused")
-        for stage in ("refocused", "not refocused")
-        for how, outcome in (("Monte Carlo", found.traced), ("linear", found.linear))
-    }
-    design = found.sensitivities.rms_refocused.square()
-    mean, worst = "RMS radius over all spots", "RMS radius of the worst spot"
-    return yield_figure(
-        {
-            mean: {label: radii.rms for label, radii in outcomes.items()},
-            worst: {label: radii.worst for label, radii in outcomes.items()},
-        },
-        {
-            mean: float((design @ weights).sqrt()),
-            worst: float(design[weights > 0.0].amax().sqrt()),
-        },
-        f"{title}\n{len(found.errors)} lenses drawn from the tolerances",
-    )
 
 
 def _by_unit(
