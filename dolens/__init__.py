@@ -50,6 +50,8 @@ _VIEWS = (
     "zernike",
 )
 LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))
+# What needs a part that nothing below it imports.
+LENS_METHODS["draw_3d"] = "dolens.lens_page.in_space.SpaceViews"
 LENS_METHODS["tolerances"] = "dolens.lens_page.lens_tolerances.ToleranceMethods"
 
 

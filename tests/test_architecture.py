@@ -41,7 +41,7 @@ ALLOWED = {
     # A page about a lens shows what all of these find out.
     "lens_page": {
         *("errors", "files", "html", "optics", "prescriptions", "analysis", "diffraction"),
-        *("tolerancing", "plotting"),
+        *("tolerancing", "plotting", "views"),
     },
     "manufacturing": {"errors", "files", "optics", "prescriptions", "tolerancing", "plotting"},
     # A search for lenses begins with paraxial optics, and ends with files and a page.

@@ -36,6 +36,7 @@ from dolens.diffraction.wavefront_map import (
     wavefront_maps,
 )
 from dolens.errors import InputError
+from dolens.lens_page.in_space import HANDS
 from dolens.lens_page.markup import View, view
 from dolens.lens_page.offenders import bright_fields, offenders
 from dolens.lens_page.overview import Overview
@@ -162,8 +163,7 @@ class PageSections:
         found = solid(self.lens, self.where, lit)
         return Content(
             space=view(found, self.where),
-            note="Drag to turn, pinch or scroll (after a click) to zoom, shift and drag to move. "
-            f"Rays at {self.where.reference_wavelength:g} nm.",
+            note=f"{HANDS} Rays at {self.where.reference_wavelength:g} nm.",
         )
 
     def spots(self) -> Content:
