@@ -5,12 +5,12 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
-from torchvision.models import GoogLeNet_Weights, MobileNet_V2_Weights, googlenet, mobilenet_v2
 
 from dolens.errors import InputError
 from dolens.reconstruction.torchvision_weights import (
@@ -18,6 +18,7 @@ from dolens.reconstruction.torchvision_weights import (
     IMAGENET_STANDARD_DEVIATION,
     PretrainedWeightsUnavailable,
     PublishedWeights,
+    published_address,
 )
 
 
@@ -62,6 +63,8 @@ class Architecture:
 def _mobilenet_v2_layers(width_multiplier: float) -> nn.Sequential:
     if not (width_multiplier > 0 and math.isfinite(width_multiplier)):
         raise InputError(f"width_multiplier={width_multiplier}: must be positive and finite")
+    from torchvision.models import mobilenet_v2
+
     # The last layer, which only the classifier needs, stays out.
     layers = mobilenet_v2(width_mult=width_multiplier).features[:-1]
     _initialise(layers)
@@ -76,6 +79,8 @@ def _mobilenet_v2_layers(width_multiplier: float) -> nn.Sequential:
 
 
 def _googlenet_layers(width_multiplier: float) -> nn.Sequential:
+    from torchvision.models import googlenet
+
     if width_multiplier != 1:
         raise InputError(f"width_multiplier={width_multiplier}: googlenet has only width 1")
     network = googlenet(aux_logits=False, init_weights=False)
@@ -107,7 +112,7 @@ ARCHITECTURES = {
             purpose="the network's backbone",
             # Not the second edition: it was trained with label smoothing, whose features
             # transfer worse (Kornblith et al. 2021).
-            url=MobileNet_V2_Weights.IMAGENET1K_V1.url,
+            address=partial(published_address, "MobileNet_V2_Weights.IMAGENET1K_V1"),
             megabytes=14,
             key="network.weights_file",
             choice="network.weights",
@@ -125,7 +130,7 @@ ARCHITECTURES = {
         published=PublishedWeights(
             network="GoogLeNet",
             purpose="the network's backbone",
-            url=GoogLeNet_Weights.IMAGENET1K_V1.url,
+            address=partial(published_address, "GoogLeNet_Weights.IMAGENET1K_V1"),
             megabytes=50,
             key="network.weights_file",
             choice="network.weights",

@@ -14,13 +14,13 @@ import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torchvision.models import VGG16_Weights, vgg16
 
 from dolens.errors import InputError
 from dolens.reconstruction.torchvision_weights import (
@@ -28,13 +28,14 @@ from dolens.reconstruction.torchvision_weights import (
     IMAGENET_STANDARD_DEVIATION,
     PretrainedWeightsUnavailable,
     PublishedWeights,
+    published_address,
 )
 
 LAYERS = 15
 VGG16 = PublishedWeights(
     network="VGG-16",
     purpose="the perceptual loss",
-    url=VGG16_Weights.IMAGENET1K_V1.url,
+    address=partial(published_address, "VGG16_Weights.IMAGENET1K_V1"),
     megabytes=528,
     key="loss.vgg16_weights",
     choice="loss.perceptual",
@@ -117,6 +118,8 @@ def load_vgg16_weights(path: str | None, download: bool = False) -> dict[str, Te
 
 
 def _empty_layers() -> nn.Sequential:
+    from torchvision.models import vgg16
+
     # On the meta device nothing is allocated or initialised: the full VGG-16 is 528 MB.
     with torch.device("meta"):
         return vgg16().features[:LAYERS]

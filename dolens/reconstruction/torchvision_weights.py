@@ -5,7 +5,7 @@ where the configuration says so.
 import logging
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -29,6 +29,16 @@ class PretrainedWeightsUnavailable(InputError):
     """
 
 
+def published_address(name: str) -> str:
+    """Return torchvision's address of weights, as `VGG16_Weights.IMAGENET1K_V1`.
+
+    torchvision is loaded here, for restorers that have none of its networks need none of it.
+    """
+    from torchvision.models import get_weight
+
+    return str(get_weight(name).url)
+
+
 @dataclass(frozen=True)
 class PublishedWeights:
     """A `PublishedWeights` names one of torchvision's files of weights for messages.
@@ -36,7 +46,7 @@ class PublishedWeights:
     Attributes:
         network: whose weights they are.
         purpose: of the weights, for messages.
-        url: torchvision's address of the file.
+        address: torchvision's of the file, asked for when it is needed; see `published_address`.
         megabytes: size of the download.
         key: the configuration key that names a file of one's own, `group.argument`.
         choice: the configuration key whose value `download` allows the download.
@@ -45,11 +55,16 @@ class PublishedWeights:
 
     network: str
     purpose: str
-    url: str
+    address: Callable[[], str]
     megabytes: int
     key: str
     choice: str
     prefix: str = ""
+
+    @property
+    def url(self) -> str:
+        """Return the address of the file."""
+        return self.address()
 
     @property
     def file_name(self) -> str:

@@ -28,7 +28,7 @@ REAL_DOWNLOAD = torch.hub.download_url_to_file
 WEIGHTS = PublishedWeights(
     network="TinyNet",
     purpose="this test",
-    url="https://example.org/models/tiny-0a1b2c3d.pth",
+    address=lambda: "https://example.org/models/tiny-0a1b2c3d.pth",
     megabytes=1,
     key="group.tiny_file",
     choice="group.tiny",
@@ -110,7 +110,7 @@ def test_a_server_that_never_answers_is_given_up(torch_cache, monkeypatch):
         monkeypatch.setattr(torchvision_weights, "DOWNLOAD_TIMEOUT_S", 0.2)
         monkeypatch.setattr(torch.hub, "download_url_to_file", REAL_DOWNLOAD)
         with pytest.raises(PretrainedWeightsUnavailable, match="timed out"):
-            replace(WEIGHTS, url=url).load(None, EXPECTED, download=True)
+            replace(WEIGHTS, address=lambda: url).load(None, EXPECTED, download=True)
     assert list(torch_cache.iterdir()) == []  # no half file is left for the next run
 
 
