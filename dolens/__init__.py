@@ -11,10 +11,20 @@ if TYPE_CHECKING:
     from dolens.optics.rays import Rays, Status
     from dolens.optics.surfaces import register_surface
     from dolens.prescriptions import load_lens, save_lens
+    from dolens.reconstruction import restore
 
 __version__ = "0.1.0"
 
-__all__ = ["InputError", "Lens", "Rays", "Status", "load_lens", "register_surface", "save_lens"]
+__all__ = [
+    "InputError",
+    "Lens",
+    "Rays",
+    "Status",
+    "load_lens",
+    "register_surface",
+    "restore",
+    "save_lens",
+]
 
 # Imported when they are first used, so that `dolens --help` need not wait for PyTorch.
 _HOMES = {
@@ -23,9 +33,13 @@ _HOMES = {
     "Status": "dolens.optics.rays",
     "load_lens": "dolens.prescriptions",
     "register_surface": "dolens.optics.surfaces",
+    "restore": "dolens.reconstruction",
     "save_lens": "dolens.prescriptions",
 }
-_PACKAGES = ("kernels", "optics", "optimize", "prescriptions", "tolerancing")
+_PACKAGES = (
+    *("kernels", "optics", "optimize", "prescriptions", "reconstruction", "rendering"),
+    "tolerancing",
+)
 _VIEWS = (
     *(
         "draw",
@@ -35,6 +49,7 @@ _VIEWS = (
         "footprint",
         "lateral_colour",
         "mtf",
+        "photograph",
         "psf",
     ),
     *(

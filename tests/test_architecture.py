@@ -35,9 +35,12 @@ ALLOWED = {
         *("errors", "typed_values", "optics", "sensor", "rendering", "analysis", "diffraction"),
         "optimize",
     },
-    "reconstruction": {"errors", "optics", "sensor"},
+    "reconstruction": {"errors", "optics", "sensor", "rendering"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
-    "views": {"errors", "optics", "analysis", "diffraction", "plotting", "optimize"},
+    "views": {
+        *("errors", "optics", "sensor", "analysis", "diffraction", "rendering", "plotting"),
+        "optimize",
+    },
     # A page about a lens shows what all of these find out.
     "lens_page": {
         *("errors", "files", "html", "optics", "prescriptions", "analysis", "diffraction"),

@@ -9,6 +9,7 @@ from dolens.experiments.camera.views.fields import FieldViews
 from dolens.optics import ray_tracing
 from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.untrained import WienerTVRestoration
+from dolens.reconstruction.whole_pictures import restore
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -105,3 +106,9 @@ def test_restorers_of_any_lens_are_told_the_noise(kind):
     noise = torch.tensor([0.01, 1e-4])
     restored = restorer(raw_image().float().to("cuda"), functions, None, noise)
     assert restored.device.type == "cuda"
+
+
+def test_a_photograph_is_taken_and_restored_there(lens):
+    photo = lens.photograph(torch.rand(3, 32, 48), light=1000)
+    restored = restore(photo)
+    assert photo.image.device.type == restored.image.device.type == "cuda"

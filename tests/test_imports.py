@@ -48,6 +48,11 @@ triplet = dolens.load_lens("cooke_triplet")
 triplet.spots(draft=True), triplet.mtf(draft=True)
 assert not loaded("numba", "scipy", "torch._dynamo", "sympy")
 
+# The restorer of photographs needs no package that trains networks.
+import dolens.reconstruction
+lens.photograph(torch.rand(3, 20, 20), light=None)
+assert not loaded("torchvision", "torchmetrics", "skimage", "lightning")
+
 # A lens on the CPU loads no kernels for GPUs.
 lens = dolens.load_lens("conf/lens/asphere.yaml", backend="cpu")
 ray = torch.tensor([[0.0, 1.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]])

@@ -252,9 +252,10 @@ for block in BLOCKS:
 
 @pytest.mark.parametrize("page", PYTHON)
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
-    """One block after another, in a folder where the lens is that the page speaks of."""
+    """One block after another, in a folder with the lens and the picture that pages speak of."""
     monkeypatch.chdir(tmp_path)
     save_lens(load_lens("double_gauss"), tmp_path / "lens.yaml")
+    Image.effect_noise((60, 40), 50).convert("RGB").save(tmp_path / "picture.jpg")
     names = {"__name__": "__main__"}
     for text in PYTHON[page]:
         for size, smaller in SIZES.items():

@@ -2,6 +2,7 @@
 
 import copy
 import doctest
+import importlib
 import re
 
 import pytest
@@ -34,6 +35,14 @@ def test_the_example_of_a_docstring_is_true(test):
         test, out=said.append
     )
     assert done.attempted and not done.failed, "".join(said)
+
+
+@pytest.mark.parametrize("name", ["", ".optimize", ".rendering", ".reconstruction"])
+def test_dir_shows_public_names_alone_and_each_is_there(name):
+    module = importlib.import_module(f"dolens{name}")
+    shown = dir(module)
+    assert set(module.__all__) <= set(shown) and all(hasattr(module, one) for one in shown)
+    assert not [one for one in shown if one.startswith("_") and one != "__version__"]
 
 
 # ---------------------------------------------------------------- optimize

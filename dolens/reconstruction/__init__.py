@@ -40,6 +40,7 @@ from dolens.reconstruction.untrained import (
     WienerBM3DRestoration,
     WienerTVRestoration,
 )
+from dolens.reconstruction.whole_pictures import restore
 from dolens.reconstruction.wiener import wiener_deconvolve
 
 __all__ = [
@@ -75,7 +76,13 @@ __all__ = [
     "psnr_db",
     "relativistic_discriminator_loss",
     "relativistic_generator_loss",
+    "restore",
     "structural_similarity",
     "total_variation",
     "wiener_deconvolve",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

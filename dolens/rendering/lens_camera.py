@@ -1,7 +1,10 @@
 """The camera that a lens file means: its colours, its image circle, pixels for a picture."""
 
+import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 
 import torch
 
@@ -14,13 +17,18 @@ from dolens.rendering.chief_ray_map import fit_chief_ray_map
 from dolens.rendering.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.scene.planar import PlanarScene
+from dolens.sensor.image_files import MEGAPIXELS
 from dolens.sensor.pixels import Sensor
+
+logger = logging.getLogger(__name__)
 
 # A plane so far away that its blur differs from that at infinity by this share of a pixel; and mm,
 # between which it is.
 _PIXEL_SHARE, _FAR, _FARTHEST = 0.01, 1e6, 1e9
 # Shares of a sensor that are tried.
 _SHARES = [1.0 - 0.05 * n for n in range(11)]
+# Pixels along each side of a sensor, at least; and mm of a pixel and of a sensor, at most.
+_FEWEST, _LARGEST_PITCH, _LARGEST_SENSOR = 16, 1e3, 1e5
 
 
 def colours_of(lens: Lens) -> tuple[float, float, float]:
@@ -117,10 +125,93 @@ def sensor_for(
     return Sensor(rows, columns, pitch)
 
 
+@torch.no_grad()
+def sensor_behind(
+    lens: Lens,
+    picture: tuple[int, int],
+    size: tuple[float, float] | None = None,
+    pixel_pitch: float | None = None,
+    scale: float = 1.0,
+    megapixels: float = MEGAPIXELS,
+) -> Sensor:
+    """Return the pixels of a picture behind a lens.
+
+    Args:
+        lens: as it is.
+        picture: its height and width, pixels.
+        size: width and height of the sensor, mm, of which the picture takes as much as its shape
+            allows; None: the largest in the image circle whose chief rays pass the lens.
+        pixel_pitch: mm; None: what the scale makes of it.
+        scale: pixels of the picture to one of the sensor, along each side.
+        megapixels: of the sensor, at most, millions of pixels.
+
+    Raises:
+        InputError: they are too many or too few, or no image circle is known.
+    """
+    if pixel_pitch is not None:
+        pixel_pitch = required_number("pixel_pitch", pixel_pitch, _LARGEST_PITCH, "mm")
+    if size is None:
+        circle = image_circle(lens)
+        sensor = sensor_for(circle, picture, scale, pixel_pitch)
+        share = usable_share(lens, sensor)
+        if 0.0 < share < 1.0:
+            logger.warning(
+                "Chief rays pass the lens to %.0f %% of its image circle alone: the sensor is "
+                "smaller by so much",
+                100.0 * share,
+            )
+            sensor = sensor_for(share * circle, picture, scale, pixel_pitch)
+    else:
+        if not isinstance(size, Sequence) or len(size) != 2:
+            raise InputError(f"sensor: {size}; allowed: its width and height in mm, as (36, 24)")
+        unit = "mm, its width and height"
+        width, height = (required_number("sensor", s, _LARGEST_SENSOR, unit) for s in size)
+        sensor = sensor_for((height, width), picture, scale, pixel_pitch)
+    pixels = 1e-6 * sensor.height * sensor.width
+    if pixels > megapixels:
+        raise InputError(
+            f"{'scale' if pixel_pitch is None else 'pixel_pitch'}: the sensor would have "
+            f"{pixels:.3g} megapixels; allowed: {megapixels:g}"
+        )
+    if min(sensor.height, sensor.width) < _FEWEST:
+        raise InputError(
+            f"sensor: {sensor.width}×{sensor.height} pixels; allowed: {_FEWEST} or more along "
+            "each side"
+        )
+    return sensor
+
+
+def required_number(
+    name: str, value: object, most: float, unit: str, from_zero: bool = False
+) -> float:
+    """Return a number above zero that a user gave.
+
+    Args:
+        name: the message begins with it.
+        value: what a user gave.
+        most: the largest that is allowed.
+        unit: for the message.
+        from_zero: whether zero is allowed too.
+
+    Raises:
+        InputError: it is none, or too large.
+    """
+    number = math.nan
+    if isinstance(value, Real) and not isinstance(value, bool):
+        number = float(value)
+    if not (0.0 < number <= most or (from_zero and number == 0.0)):
+        least = "0" if from_zero else "above 0"
+        largest = "" if math.isinf(most) else f" to {most:g}"
+        said = repr(value) if isinstance(value, str) else value
+        raise InputError(f"{name}: {said}; allowed: {least}{largest} {unit}")
+    return number
+
+
+@torch.no_grad()
 def distance_of(lens: Lens, depth: float, sensor: Sensor) -> float:
     """Return a depth (mm) itself, or of infinity one that blurs alike within 1 % of a pixel."""
     if math.isfinite(depth):
         return depth
     first = lens.first_order(lens.primary_wavelength)
-    size = abs(float(first.efl.detach()) * float(first.entrance_pupil.diameter))
+    size = abs(float(first.efl) * float(first.entrance_pupil.diameter))
     return min(max(_FAR, size / (_PIXEL_SHARE * sensor.pixel_pitch)), _FARTHEST)

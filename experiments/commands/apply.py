@@ -22,15 +22,14 @@ from dolens.experiments.commands.pictures import (
     check_files,
     check_size,
     names_at_depths,
-    picture_of,
     read_array,
-    write_picture,
     written,
 )
 from dolens.experiments.running.finished_run import FinishedRun, load_run
 from dolens.experiments.running.trust import own_folder
 from dolens.reconstruction.whole_pictures import restore_whole_picture
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.display import linear_picture, write_picture
 from dolens.sensor.readout import Readout
 
 logger = logging.getLogger(__name__)
@@ -117,12 +116,10 @@ class PictureCamera:
         Raises:
             InputError: the file cannot be read, or is too small; or the depth lies in the lens.
         """
-        picture = picture_of(file, self.options)
-        check_size(file, picture.linear.shape[-2:])
-        names = names_at_depths(picture.name, self.depths())
-        return [
-            self._at_depth(picture.linear, depth, name, folder) for depth, name in names.items()
-        ]
+        linear = linear_picture(file, self.options.megapixels)
+        check_size(file, linear.shape[-2:])
+        names = names_at_depths(file.stem, self.depths())
+        return [self._at_depth(linear, depth, name, folder) for depth, name in names.items()]
 
     def _at_depth(self, linear: Tensor, depth: float, name: str, folder: Path) -> Applied:
         views, options = self.camera.views, self.options

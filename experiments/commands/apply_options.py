@@ -15,8 +15,8 @@ _SMALLEST_SCALE, _LARGEST_SCALE = 0.01, 1000.0
 _FORMATS = ("png", "tif")
 _UNITS = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1e3, "km": 1e6}
 _LENGTH = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|nan|inf(?:inity)?) ?([a-z]*)", re.ASCII)
-# Electrons, micrometres and millimetres that a sensor may have.
-_MOST_ELECTRONS, _LARGEST_PITCH, _LARGEST_SENSOR = 1e9, 1e6, 1e5
+# Micrometres and millimetres that a sensor may have.
+_LARGEST_PITCH, _LARGEST_SENSOR = 1e6, 1e5
 
 
 def depth_of(text: str) -> float:
@@ -161,14 +161,6 @@ class LensOptions(PictureOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 < self.light <= _MOST_ELECTRONS:
-            raise InputError(
-                f"--light: {self.light:g}; allowed: above 0, to {_MOST_ELECTRONS:g} electrons"
-            )
-        if not 0.0 <= self.read_noise <= _MOST_ELECTRONS:
-            raise InputError(
-                f"--read-noise: {self.read_noise:g}; allowed: 0 to {_MOST_ELECTRONS:g} electrons"
-            )
         if self.pitch is not None and not 0.0 < self.pitch <= _LARGEST_PITCH:
             raise InputError(
                 f"--pitch: {self.pitch:g}; allowed: above 0, to {_LARGEST_PITCH:g} micrometres"

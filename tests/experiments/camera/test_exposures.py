@@ -11,8 +11,8 @@ from dolens.experiments.camera.network_export import exportable
 from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.pictures import write_picture
 from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.display import write_picture
 from tests.experiments.conftest import finished_run
 from tests.experiments.tiny_experiment import TINY
 from tests.reconstruction.test_readouts import textured

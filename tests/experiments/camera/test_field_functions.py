@@ -13,12 +13,12 @@ from dolens.experiments.camera.views.fields import FieldViews
 from dolens.experiments.camera.views.truth import field_functions
 from dolens.experiments.commands.apply import apply_run
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.pictures import write_picture
 from dolens.reconstruction import WienerTVRestoration, psnr_db
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.colour import srgb_to_linear
+from dolens.sensor.display import write_picture
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 from tests.experiments.camera.test_field_views import LINES, WHOLE, doublet

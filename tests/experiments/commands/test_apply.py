@@ -16,11 +16,13 @@ from dolens.experiments.camera.restored_windows import margin_of, restore_in_win
 from dolens.experiments.camera.views.whole import Placing, at_depth, axial_function, convolved
 from dolens.experiments.commands.apply import PictureCamera, apply_run, signal_of
 from dolens.experiments.commands.apply_options import Options
-from dolens.experiments.commands.pictures import read_array, read_picture, write_picture
+from dolens.experiments.commands.pictures import read_array
 from dolens.experiments.running.finished_run import load_run
 from dolens.reconstruction import GeneralRestoration, UNetRestoration, WienerUNetRestoration
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
+from dolens.sensor.display import write_picture
+from dolens.sensor.pictures import read_pixels
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
@@ -180,10 +182,10 @@ def test_a_picture_goes_in_and_comes_out(applied, tmp_path):
     raw = folder / "blocks_8m_raw.npy"
     camera.options = Options(raw=True, bits=16)
     camera.restore(raw, tmp_path)
-    again = read_picture(tmp_path / "blocks_8m_raw_restored.png").linear
-    first = read_picture(folder / "blocks_8m_restored.png").linear
+    again = read_pixels(tmp_path / "blocks_8m_raw_restored.png").linear()
+    first = read_pixels(folder / "blocks_8m_restored.png").linear()
     assert (linear_to_srgb(again) - linear_to_srgb(first)).abs().max() < 1.0 / 255
-    assert read_picture(folder / "blocks_8m_restored.png").bits == 16
+    assert read_pixels(folder / "blocks_8m_restored.png").bits == 16
 
 
 def test_noise_belongs_to_the_seed_and_not_to_the_windows(pictures, tmp_path):
@@ -192,7 +194,7 @@ def test_noise_belongs_to_the_seed_and_not_to_the_windows(pictures, tmp_path):
     def restored(**options):
         pictures.options = Options(bits=16, **options)
         pictures.apply(tmp_path / "grey.png", tmp_path)
-        return linear_to_srgb(read_picture(tmp_path / "grey_restored.png").linear)
+        return linear_to_srgb(read_pixels(tmp_path / "grey_restored.png").linear())
 
     first, small, other = restored(), restored(window=64), restored(seed=1)
     assert (first - small).abs().max() < 1e-4
@@ -203,16 +205,16 @@ def test_noise_belongs_to_the_seed_and_not_to_the_windows(pictures, tmp_path):
 def test_sixteen_bits_survive(tmp_path, suffix):
     values = torch.arange(3 * 20 * 30).reshape(3, 20, 30) / 65535
     write_picture(tmp_path / f"deep.{suffix}", values, 16)
-    picture = read_picture(tmp_path / f"deep.{suffix}")
+    picture = read_pixels(tmp_path / f"deep.{suffix}")
     assert picture.bits == 16
-    assert (linear_to_srgb(picture.linear) - values).abs().max() < 1e-6
+    assert (linear_to_srgb(picture.linear()) - values).abs().max() < 1e-6
 
 
 def test_eight_bits_are_read_as_the_training_reads_them(tmp_path):
     values = torch.randint(0, 256, (3, 9, 7), dtype=torch.uint8)
     Image.fromarray(values.permute(1, 2, 0).numpy()).save(tmp_path / "a.png")
-    picture = read_picture(tmp_path / "a.png")
-    assert (picture.linear - srgb_to_linear(values.double() / 255)).abs().max() < 6e-8
+    picture = read_pixels(tmp_path / "a.png")
+    assert (picture.linear() - srgb_to_linear(values.double() / 255)).abs().max() < 6e-8
     assert picture.bits == 8
 
 
@@ -230,20 +232,20 @@ def test_pictures_of_all_kinds_come_out_upright(tmp_path, orientation):
         extratags=[(274, "H", 1, orientation, True)],
     )  # fmt: skip
     for name in ("a.png", "b.tif"):
-        encoded = linear_to_srgb(read_picture(tmp_path / name).linear) * 255
+        encoded = linear_to_srgb(read_pixels(tmp_path / name).linear()) * 255
         assert np.array_equal(encoded.round().permute(1, 2, 0).numpy(), upright), name
 
 
 def test_grey_and_transparent_pictures(tmp_path):
     grey = np.linspace(0, 65535, 48).reshape(6, 8).astype(np.uint16)
     Image.fromarray(grey).save(tmp_path / "grey.png")
-    found = read_picture(tmp_path / "grey.png")
-    assert found.bits == 16 and torch.equal(found.linear[0], found.linear[2])
+    found = read_pixels(tmp_path / "grey.png")
+    assert found.bits == 16 and torch.equal(found.linear()[0], found.linear()[2])
     rgba = np.full((4, 4, 4), 65535, np.uint16)
     rgba[..., 3] = 32768
     tifffile.imwrite(tmp_path / "half.tif", rgba, photometric="rgb", extrasamples=["unassalpha"])
     # Half of the light of white: composited in linear light over black.
-    found = read_picture(tmp_path / "half.tif").linear
+    found = read_pixels(tmp_path / "half.tif").linear()
     assert (found - 32768 / 65535).abs().max() < 1e-6
 
 

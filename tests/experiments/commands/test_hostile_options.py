@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.errors import InputError, one_line, readable
 from dolens.experiments.commands.apply import PictureCamera
-from dolens.experiments.commands.apply_lens import LensCamera
+from dolens.experiments.commands.apply_lens import AppliedLens
 from dolens.experiments.running.command_line import prepared
 from dolens.lens_page.page import Written
 
@@ -120,7 +120,7 @@ def at_work(work, monkeypatch):
     monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda _: nothing)
     for name in ("apply", "restore"):
         monkeypatch.setattr(PictureCamera, name, lambda *_: [])
-    monkeypatch.setattr(LensCamera, "apply", lambda *_: [])
+    monkeypatch.setattr(AppliedLens, "apply", lambda *_: [])
 
 
 def said(given):

@@ -1,0 +1,95 @@
+"""A lens photographs a picture."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dolens.views.overview import as_lens
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from dolens.rendering.photograph import Photograph
+
+
+class PhotographViews:
+    """The method of `Lens` that photographs."""
+
+    def photograph(
+        self,
+        picture: str | Path | np.ndarray | Tensor,
+        distance: float | None = None,
+        light: float | None = 100.0,
+        *,
+        read_noise: float = 3.0,
+        pattern: str | None = None,
+        sensor: tuple[float, float] | None = None,
+        pixel_pitch: float | None = None,
+        diffraction: str | None = None,
+        seed: int = 0,
+    ) -> Photograph:
+        """Return what a sensor behind the lens sees of a picture, which is a plane before it.
+
+        The picture fills the sensor.  Each place has the blur of its own, with distortion, lateral
+        colour, relative illumination and diffraction.  Red, green and blue are the longest, the
+        reference and the shortest wavelength of the lens.  `dolens.restore` restores what it gives.
+
+        512×512 pixels take about a second of one core, five where blur is hundreds of pixels wide,
+        and three more in the first call of a session; the pictures take about 110 bytes a pixel.
+
+        >>> import torch
+        >>> lens = dolens.load_lens("cooke_triplet")
+        >>> picture = torch.rand(3, 48, 64)  # or a path
+        >>> photo = lens.photograph(picture, distance=2000, light=1000)
+        >>> photo.image.shape, photo.distance
+        (torch.Size([3, 48, 64]), 2000.0)
+        >>> photo.noise  # variance 0.001·light + 0.000009
+        (0.001, 9e-06)
+
+        Args:
+            picture: a file, an array (H, W, 3) or (H, W), or a tensor (3, H, W) or (H, W), of sRGB
+                values: uint8, uint16, or fractions from 0 to 1.
+            distance: mm in front of the first vertex, `inf` for infinity; None: the lens's own
+                object distance.
+            light: electrons of a white pixel on the axis; None: no noise at all.
+
+        Rarely needed:
+            read_noise: electrons, standard deviation.
+            pattern: of colour filters in front of the pixels, as `RGGB`; None: each pixel sees all
+                three colours.
+            sensor: its width and height, mm; None: the largest of the picture's shape in the image
+                circle.
+            pixel_pitch: mm; None: a pixel of the picture is one of the sensor.
+            diffraction: `none`, `limit` or `wave`; None: where it shows, by the model it needs.
+            seed: of the noise.
+
+        Returns:
+            A `Photograph`: `image` and `truth` (3, H, W), sRGB; `save(path)`; it shows itself in a
+            notebook.
+
+        Raises:
+            InputError: the picture cannot be read; a number out of range; or a lens that has no
+                image circle, sees too wide a field for a plane, or that renderers refuse.
+        """
+        from dolens.errors import InputError
+        from dolens.rendering.lens_camera import required_number, sensor_behind
+        from dolens.rendering.photograph import LensCamera, readout_in
+        from dolens.sensor.display import linear_picture
+
+        lens = as_lens(self)
+        distances = (
+            []
+            if distance is None
+            else [required_number("distance", distance, math.inf, "mm, or infinity")]
+        )
+        if not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise InputError(f"seed: {seed}; allowed: whole numbers from 0 to 2^63 - 1")
+        readout = readout_in(light, read_noise, pattern)
+        linear = linear_picture(picture)
+        height, width = linear.shape[-2:]
+        pixels = sensor_behind(lens, (height, width), sensor, pixel_pitch)
+        camera = LensCamera.of(lens, pixels, readout, distances, diffraction)
+        return next(camera.photographs(linear, seed))
