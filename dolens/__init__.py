@@ -7,6 +7,7 @@ from dolens.errors import InputError
 from dolens.optics import LENS_METHODS
 
 if TYPE_CHECKING:
+    from dolens.lens_search.short_search import search
     from dolens.optics.lens import Lens
     from dolens.optics.rays import Rays, Status
     from dolens.optics.surfaces import register_surface
@@ -24,6 +25,7 @@ __all__ = [
     "register_surface",
     "restore",
     "save_lens",
+    "search",
 ]
 
 # Imported when they are first used, so that `dolens --help` need not wait for PyTorch.
@@ -35,6 +37,7 @@ _HOMES = {
     "register_surface": "dolens.optics.surfaces",
     "restore": "dolens.reconstruction",
     "save_lens": "dolens.prescriptions",
+    "search": "dolens.lens_search.short_search",
 }
 _PACKAGES = (
     *("kernels", "optics", "optimize", "prescriptions", "reconstruction", "rendering"),

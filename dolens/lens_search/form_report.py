@@ -324,7 +324,7 @@ def report_form(
     found: FoundLens,
     number: int,
     required: Requirements,
-    folder: str | Path,
+    folder: str | Path | None,
     starts: int | None = None,
     designs: int | None = None,
     suffixes: Sequence[str] = SUFFIXES,
@@ -337,7 +337,7 @@ def report_form(
         found: the best lens of the form.
         number: its rank, from 1.
         required: what it must keep.
-        folder: for its files; it is made.
+        folder: for its files; it is made.  None: none are written.
         starts: how many starts led to it.
         designs: how many designs are of this form.
         suffixes: of the formats.
@@ -373,7 +373,7 @@ def report_form(
         verification,
         sensitivity,
         section,
-        write_form(lens, folder, number, suffixes),
+        () if folder is None else write_form(lens, folder, number, suffixes),
         starts,
         designs,
         tuple(problems),

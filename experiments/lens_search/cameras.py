@@ -29,7 +29,7 @@ from dolens.experiments.lens_search.trained_camera import CameraTask, train_came
 from dolens.experiments.running.finished_run import load_run
 from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
-from dolens.experiments.workers import OwnThreads, workers_of
+from dolens.experiments.workers import workers_of
 from dolens.lens_search.search import SearchPlan
 from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens
@@ -38,7 +38,7 @@ from dolens.plotting.pictures import comparison_figure
 from dolens.prescriptions import load_lens
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb
-from dolens.tasks import TaskMap
+from dolens.tasks import OwnThreads, TaskMap
 from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)

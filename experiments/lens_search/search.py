@@ -16,7 +16,6 @@ from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.lens_search.found_forms import (
-    Finds,
     check_rows,
     form_reports,
     form_rows,
@@ -25,10 +24,11 @@ from dolens.experiments.lens_search.found_forms import (
 )
 from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
-from dolens.experiments.workers import OwnThreads, workers_of
+from dolens.experiments.workers import workers_of
 from dolens.files import written_whole
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designs import Designs, designed_lens
+from dolens.lens_search.finds import Finds
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.glass.choice import chosen_glasses
 from dolens.lens_search.glass.glass_merit import merit_of
@@ -38,7 +38,7 @@ from dolens.lens_search.search_report import WITHIN
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import random_starts
 from dolens.optics.lens import Lens
-from dolens.tasks import TaskMap
+from dolens.tasks import OwnThreads, TaskMap
 from dolens.tasks import stage as named_stage
 
 logger = logging.getLogger(__name__)

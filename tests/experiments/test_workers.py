@@ -14,8 +14,8 @@ import torch
 from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.configuration import checked
-from dolens.experiments.workers import OwnThreads, RayWorkers, workers_of
-from dolens.tasks import TaskError, listening
+from dolens.experiments.workers import RayWorkers, workers_of
+from dolens.tasks import OwnThreads, TaskError, listening
 from dolens.tolerancing import tolerances_from, trace_perturbed
 
 # To import it would settle its mode of authentication.

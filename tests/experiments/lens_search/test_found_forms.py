@@ -3,7 +3,7 @@
 import torch
 
 from dolens import load_lens
-from dolens.experiments.lens_search.found_forms import Course, starts_and_designs
+from dolens.lens_search.finds import Course, starts_and_designs
 from dolens.lens_search.forms import FoundLens
 
 
