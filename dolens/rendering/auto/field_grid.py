@@ -197,7 +197,7 @@ def choose_fields(
     if not candidates:
         raise InputError(
             f"renderer auto: point spread functions are wider than {_LARGEST} pixels; "
-            "give larger pixels, or renderer=rays"
+            "give larger pixels (pixel_pitch), or renderer=rays"
         )
     nodes: dict[tuple[int, int], Survey] = {}
     best: tuple[float, PsfRenderer] | None = None
