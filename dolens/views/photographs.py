@@ -37,8 +37,9 @@ class PhotographViews:
         colour, relative illumination and diffraction.  Red, green and blue are the longest, the
         reference and the shortest wavelength of the lens.  `dolens.restore` restores what it gives.
 
-        512×512 pixels take about a second of one core, five where blur is hundreds of pixels wide,
-        and three more in the first call of a session; the pictures take about 110 bytes a pixel.
+        512×512 pixels take about a second of one core, and five to twenty where blur is hundreds of
+        pixels wide; the first call of a session takes three more.  The pictures take about 110
+        bytes a pixel.
 
         >>> import torch
         >>> lens = dolens.load_lens("cooke_triplet")
