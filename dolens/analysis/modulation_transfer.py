@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
-from dolens.analysis.ray_intercepts import trace_ray_intercepts
+from dolens.analysis.ray_intercepts import AimedAtStop, trace_ray_intercepts
 from dolens.analysis.spot_diagram import AIRY, spot_diagram, working_f_numbers
 from dolens.errors import InputError, check_choice
 from dolens.optics.aiming import field_line
@@ -107,7 +107,11 @@ def diffraction_limited_transfer(
 
 @torch.no_grad()
 def modulation(
-    lens: Lens, where: Conditions, frequencies: Sequence[float] | Tensor, rays: int = 6000
+    lens: Lens,
+    where: Conditions,
+    frequencies: Sequence[float] | Tensor,
+    rays: int = 6000,
+    aimed: AimedAtStop | None = None,
 ) -> Modulation:
     """Compute the polychromatic geometric MTF of a lens from rays spread uniformly over the stop.
 
@@ -120,6 +124,10 @@ def modulation(
         rays: of each field and wavelength, a multiple of four, before apertures clip any.  What is
             left of contrast far beyond the first zero is noise of 1/√rays or less.
 
+    Rarely needed:
+        aimed: `aimed_at_stop` of the lens at the wavelengths that count, where several analyses
+            share it.
+
     Raises:
         InputError: a wrong number of rays.
     """
@@ -128,7 +136,7 @@ def modulation(
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
     where = where.that_count()
-    intercepts = trace_ray_intercepts(lens, where, pupil)
+    intercepts = trace_ray_intercepts(lens, where, pupil, aimed=aimed)
     light = (weight * intercepts.valid * where.weights[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
@@ -156,15 +164,25 @@ def modulation(
 
 
 @torch.no_grad()
-def frequency_range(lens: Lens, where: Conditions, count: int = 61) -> Tensor:
+def frequency_range(
+    lens: Lens, where: Conditions, count: int = 61, aimed: AimedAtStop | None = None
+) -> Tensor:
     """Return frequencies (count,), cycles/mm, from zero to where the sharpest field leaves little.
 
     A spot of Gaussian profile with the RMS radius r leaves a hundredth of the contrast at 0.68/r;
     the end is that frequency or the cut-off of diffraction where that is lower, rounded up to 1, 2
     or 5 times a power of ten.
+
+    Args:
+        lens: the lens.
+        where: fields, wavelengths with their weights, and object distance.
+        count: frequencies.
+
+    Rarely needed:
+        aimed: as `modulation` takes it.
     """
     lens = in_double_precision(lens)
-    spots = spot_diagram(lens, where.that_count(), 400)
+    spots = spot_diagram(lens, where.that_count(), 400, aimed)
     cutoff = float((AIRY / spots.airy_radius).min())
     radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
     end = min(cutoff, 0.68 / max(radius, 1e-9))

@@ -53,9 +53,51 @@ class RayIntercepts:
     chief: Tensor
 
 
+@dataclass(frozen=True)
+class AimedAtStop:
+    """Rays of F fields and W wavelengths are aimed at points of the stop, to be traced or to be
+    fitted.
+
+    Attributes:
+        points: (N, 2), on the stop over its semi-diameter; the first is its centre.
+        rays: (F, W, N); the reference wavelength is one of the W, or one more at the end.
+        reference: which of them it is.
+    """
+
+    points: Tensor
+    rays: AimedRays
+    reference: int
+
+
+@torch.no_grad()
+def aimed_at_stop(lens: Lens, where: Conditions, pupil: Tensor | None = None) -> AimedAtStop:
+    """Aim rays at the centre of the stop and other points, separately for every wavelength.
+
+    Args:
+        lens: of any precision.
+        where: fields, wavelengths and object distance.
+        pupil: (N, 2); None: few, which determine all others.
+    """
+    lens = in_double_precision(lens)
+    field, waves = where.fields.to(lens.device), where.wavelengths.to(lens.device)
+    # The chief ray of the reference wavelength is always one of the rays.
+    reference = torch.nonzero(waves == where.reference_wavelength).flatten()
+    at = int(reference[0]) if len(reference) else len(waves)
+    if at == len(waves):
+        waves = torch.cat([waves, waves.new_tensor([where.reference_wavelength])])
+    centre = field.new_zeros(1, 2)
+    points = _nodes().to(field) if pupil is None else torch.cat([centre, pupil.to(field)])
+    rays = lens.aim(field[:, None, None], points, waves[:, None], where.object_distance)
+    return AimedAtStop(points, rays, at)
+
+
 @torch.no_grad()
 def trace_ray_intercepts(
-    lens: Lens, where: Conditions, pupil: Tensor, exact: bool = False
+    lens: Lens,
+    where: Conditions,
+    pupil: Tensor,
+    exact: bool = False,
+    aimed: AimedAtStop | None = None,
 ) -> RayIntercepts:
     """Aim rays at points of the stop, separately for every wavelength, and trace them together.
 
@@ -66,8 +108,9 @@ def trace_ray_intercepts(
 
     Rarely needed:
         exact: aim every ray, rather than to fit a few.
+        aimed: `aimed_at_stop` of the same lens and conditions, where several analyses share it.
     """
-    launched = launch_through_stop(lens, where, pupil, exact)
+    launched = launch_through_stop(lens, where, pupil, exact, aimed)
     system = in_double_precision(lens).system()
     hit, chief = trace_rays(system, launched.rays), trace_rays(system, launched.chief)
     valid = hit.valid & launched.started
@@ -103,34 +146,30 @@ class StopRays:
 
 @torch.no_grad()
 def launch_through_stop(
-    lens: Lens, where: Conditions, pupil: Tensor, exact: bool = False
+    lens: Lens,
+    where: Conditions,
+    pupil: Tensor,
+    exact: bool = False,
+    aimed: AimedAtStop | None = None,
 ) -> StopRays:
     """Aim rays at points of the stop, in front of the lens; arguments of `trace_ray_intercepts`."""
     lens = in_double_precision(lens)
     field, waves = where.fields.to(lens.device), where.wavelengths.to(lens.device)
     pupil = pupil.to(field)
     count = len(waves)
-    # The chief ray of the reference wavelength is always one of the rays.
-    reference = torch.nonzero(waves == where.reference_wavelength).flatten()
-    at = int(reference[0]) if len(reference) else count
-    if at == count:
-        waves = torch.cat([waves, waves.new_tensor([where.reference_wavelength])])
-
-    centre = pupil.new_zeros(1, 2)
-    nodes = torch.cat([centre, pupil]) if exact else _nodes().to(field)
-    aimed = lens.aim(field[:, None, None], nodes, waves[:, None], where.object_distance)
-    chief_rays = Rays(aimed.position[:, at, 0], aimed.direction[:, at, 0], waves[at])
+    aimed = aimed or aimed_at_stop(lens, where, pupil if exact else None)
+    found, at = aimed.rays, aimed.reference
+    reference = waves.new_tensor(where.reference_wavelength)
+    chief_rays = Rays(found.position[:, at, 0], found.direction[:, at, 0], reference)
     if exact:
-        rays = Rays(
-            aimed.position[:, :count, 1:], aimed.direction[:, :count, 1:], waves[:count, None]
-        )
-        started = aimed.converged[:, :count, 1:]
+        rays = Rays(found.position[:, :count, 1:], found.direction[:, :count, 1:], waves[:, None])
+        started = found.converged[:, :count, 1:]
     else:
-        rays, started = _fitted(where, aimed, nodes, pupil)
-        rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:count, None])
+        rays, started = _fitted(where, found, aimed.points, pupil)
+        rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:, None])
         started = started[:, :count, None]
     beam = (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
-    return StopRays(rays, started & beam, chief_rays, aimed.converged[:, at, 0])
+    return StopRays(rays, started & beam, chief_rays, found.converged[:, at, 0])
 
 
 def _along_surface(

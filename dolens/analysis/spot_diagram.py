@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.pupil_quadrature import uniform_pupil_points
-from dolens.analysis.ray_intercepts import trace_ray_intercepts
+from dolens.analysis.ray_intercepts import AimedAtStop, trace_ray_intercepts
 from dolens.errors import InputError
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
@@ -55,7 +55,9 @@ class SpotDiagram(AtConditions):
 
 
 @torch.no_grad()
-def spot_diagram(lens: Lens, where: Conditions, rays: int = 2000) -> SpotDiagram:
+def spot_diagram(
+    lens: Lens, where: Conditions, rays: int = 2000, aimed: AimedAtStop | None = None
+) -> SpotDiagram:
     """Trace rays spread uniformly over the stop, at every field and wavelength.
 
     Args:
@@ -65,12 +67,15 @@ def spot_diagram(lens: Lens, where: Conditions, rays: int = 2000) -> SpotDiagram
             thousand err by some 1e-4 of themselves where only the stop clips, and by a few
             hundredths at the edge of a field that has lost most of its light.
 
+    Rarely needed:
+        aimed: `aimed_at_stop` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = uniform_pupil_points(rays)
-    intercepts = trace_ray_intercepts(lens, where, pupil)
+    intercepts = trace_ray_intercepts(lens, where, pupil, aimed=aimed)
     points, valid = intercepts.points, intercepts.valid
 
     light = weight * valid

@@ -18,7 +18,7 @@ from dolens.analysis.field_curves import DISTORTION_REFERENCES, field_curves, im
 from dolens.analysis.footprint import footprint
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
-from dolens.analysis.ray_intercepts import ray_fans
+from dolens.analysis.ray_intercepts import aimed_at_stop, ray_fans
 from dolens.analysis.spot_diagram import rms_against_field, rms_against_wavelength
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.illumination import relative_illumination
@@ -180,9 +180,10 @@ class PageSections:
 
     def mtf(self) -> Content:
         """Plot the MTF with diffraction, and that of rays alone."""
-        frequencies = frequency_range(self.lens, self.where)
+        aimed = aimed_at_stop(self.lens, self.where.that_count())
+        frequencies = frequency_range(self.lens, self.where, aimed=aimed)
         wave = diffraction_modulation(self.lens, self.where, frequencies, self._pupils)
-        rays = modulation(self.lens, self.where, frequencies, _MTF_RAYS)
+        rays = modulation(self.lens, self.where, frequencies, _MTF_RAYS, aimed)
         figure = modulation_comparison_figure(wave, rays, title="")
         return Content(
             {"mtf": figure},

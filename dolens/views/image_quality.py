@@ -134,6 +134,7 @@ class ImageQualityViews:
         if draft and kind == "huygens":
             raise InputError("draft: True with kind 'huygens'; allowed: drafts of kind 'fourier'")
         from dolens.analysis.modulation_transfer import frequency_range, modulation
+        from dolens.analysis.ray_intercepts import aimed_at_stop
         from dolens.diffraction.huygens import huygens_modulation
         from dolens.diffraction.modulation_transfer import diffraction_modulation
         from dolens.plotting.modulation import modulation_comparison_figure
@@ -141,16 +142,18 @@ class ImageQualityViews:
         lens, given = looked_at(self.mtf, fields, wavelengths, object_distance, aperture)
         if draft:
             lens = traced_at_once(lens, given)
+        geometric = geometric and not (draft and diffraction)
+        aimed = aimed_at_stop(lens, given.that_count()) if geometric else None
         if frequencies is None:
-            frequencies = frequency_range(lens, given)
+            frequencies = frequency_range(lens, given, aimed=aimed)
         wave = rays = None
         if diffraction and kind == "huygens":
             wave = huygens_modulation(lens, given, frequencies)
         elif diffraction:
             wave = diffraction_modulation(lens, given, frequencies, draft=draft)
-        if geometric and not (draft and diffraction):
-            settings = (_DRAFT_MTF,) if draft else ()
-            rays = modulation(lens, given, frequencies, *settings)
+        if geometric:
+            settings = {"rays": _DRAFT_MTF} if draft else {}
+            rays = modulation(lens, given, frequencies, aimed=aimed, **settings)
         title = title_of("Modulation transfer function", lens, given, draft)
         return shown(modulation_comparison_figure(wave, rays, title), draft)
 
