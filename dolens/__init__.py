@@ -70,6 +70,7 @@ _VIEWS = (
 LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))
 # What needs a part that nothing below it imports.
 LENS_METHODS["draw_3d"] = "dolens.lens_page.in_space.SpaceViews"
+LENS_METHODS["search_neighbours"] = "dolens.lens_search.neighbours.SearchMethods"
 LENS_METHODS["tolerances"] = "dolens.lens_page.lens_tolerances.ToleranceMethods"
 
 

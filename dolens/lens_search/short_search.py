@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from dolens.lens_search.finds import Finds, course_picture, starts_and_designs
 from dolens.lens_search.form_report import FormReport, report_form, write_form
 from dolens.lens_search.glass.choice import GlassChoice
 from dolens.lens_search.glass.glass_step import GlassPlan
-from dolens.lens_search.search import SearchPlan
+from dolens.lens_search.search import SearchPlan, Step
 from dolens.lens_search.search import search as steps_of
 from dolens.lens_search.search_report import sections_figure
 from dolens.lens_search.specification import Limits, Specification
@@ -99,8 +100,8 @@ class LensSearch:
         """Return what was asked for."""
         asked, many = self.specification, self.specification.elements > 1
         return (
-            f"{asked.elements} element{'s' * many}, f = {asked.focal_length:g} mm, "
-            f"F/{asked.f_number:g}, ±{max(asked.fields):g}°"
+            f"{asked.elements} element{'s' * many}, f = {asked.focal_length:.4g} mm, "
+            f"F/{asked.f_number:.3g}, ±{max(asked.fields):.4g}°"
         )
 
     @property
@@ -220,20 +221,46 @@ def search(
     asked = specification(efl, f_number, field, elements, glasses, wavelengths, limits or {})
     known = sorted(set(SearchPlan.__dataclass_fields__) - {"starts", "seed"})
     check_keys(plan, known, "search()")
+    check_amounts(starts, forms, seed, seconds)
+    usual = {"batch": _BATCH, "glass": GlassPlan(forms=forms)}
+    how = SearchPlan(**{**usual, **plan, "starts": starts, "seed": seed})
+    return collected(asked, how, partial(steps_of, asked, how), forms, started, seconds)
+
+
+def check_amounts(starts: int, forms: int, seed: int, seconds: float | None) -> None:
+    """Refuse amounts out of range; see `search`."""
     for name, value, least in (("starts", starts, 1), ("forms", forms, 1), ("seed", seed, 0)):
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise InputError(f"{name}: {value!r}; allowed: an integer of {least} or more")
     if seconds is not None and not (isinstance(seconds, int | float) and seconds > 0.0):
         raise InputError(f"seconds: {seconds!r}; allowed: a positive number, or None")
-    usual = {"batch": _BATCH, "glass": GlassPlan(forms=forms)}
-    how = SearchPlan(**{**usual, **plan, "starts": starts, "seed": seed})
-    finds = Finds(asked, how)
+
+
+def collected(
+    asked: Specification,
+    plan: SearchPlan,
+    steps: Callable[[TaskMap], Iterator[Step]],
+    forms: int,
+    started: float,
+    seconds: float | None,
+) -> LensSearch:
+    """Search, and check the best forms.
+
+    Args:
+        asked: of every lens.
+        plan: of the search.
+        steps: map of tasks → what each finds.
+        forms: how many are checked.
+        started: time of `time.perf_counter` when it began.
+        seconds: see `search`.
+    """
+    finds = Finds(asked, plan)
     with OwnThreads().open() as map_tasks:
         mapped = map_tasks
         if seconds is not None:
             growth = seconds * (1.0 if asked.glass_choice is None else _GROWTH)
             mapped = _limited(map_tasks, started + growth, started + seconds)
-        for step in steps_of(asked, how, mapped):
+        for step in steps(mapped):
             finds.add(step, time.perf_counter() - started)
     finds.rank(forms)
     required = Requirements.of(asked)
