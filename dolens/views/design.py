@@ -47,7 +47,10 @@ class DesignViews:
                 `edge_thickness`, `distortion` (of the farthest field unless one is named) and the
                 others of `dolens.optimize.operands`, in mm, degrees and per cent; or settings, as
                 `{"distortion": {"min": -2, "max": 2, "field": (0, 20), "weight": 10}}`.  Each is
-                kept by its weight, 100 per unit unless given, not to the last digit.
+                kept by its weight, 100 per unit unless given, not to the last digit.  Glass and
+                air, on the axis and at the edges, stay above half of the least that the lens has,
+                unless `keep` names them (`centre_thickness`, `edge_thickness`, `air_gap`,
+                `edge_air_gap`).
             iterations: at most.
             fields: numbers along y or points (x, y): degrees, or mm on a near object; None: the
                 lens's own.
@@ -70,7 +73,7 @@ class DesignViews:
         from dolens.analysis.fields_and_wavelengths import as_wavelengths, field_points
         from dolens.optimize.merit_settings import LOSSES, RESIDUALS, MeritSettings
         from dolens.optimize.rounds import design
-        from dolens.views.optimization import Optimization, operands_to_keep
+        from dolens.views.optimization import Optimization, gaps_that_stay, operands_to_keep
 
         lens = as_lens(self)
         check_choice(for_, (*RESIDUALS, *LOSSES), "for_")
@@ -86,9 +89,10 @@ class DesignViews:
         )
         where = settings.conditions_of(lens)
         wanted = operands_to_keep(keep or {}, lens, where.fields.tolist())
-        settings = replace(settings, operands=list(wanted.values()))
+        held = gaps_that_stay(lens, wanted, where.object_distance)
+        settings = replace(settings, operands=[*wanted.values(), *held.values()])
         found = design(lens, patterns(variables), settings, iterations)
-        record = Optimization.of(found, for_, wanted, where)
+        record = Optimization.of(found, for_, wanted, held, where)
         better = found.after.lens.storing_its_values().to(lens.dtype)
         better.optimization = record
         return better

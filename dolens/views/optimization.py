@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _MEANS = {"spots": ("RMS spot radius", "µm"), "wavefront": ("RMS wavefront error", "waves")}
 # Per mm, degree or per cent, beside spots in µm; a magnification has smaller numbers.
 _WEIGHT, _OF_MAGNIFICATION = 100.0, 1e4
+# Of gaps that nobody asked for: a lens that can be made comes before what was asked for.
+_OF_GAPS = 1000.0
 _OTHER_NAMES = {"back_focus": "bfd"}
 _KEYS = ("target", "min", "max", "weight", "field", "gaps", "state")
 # On the axis they are zero.
@@ -108,14 +110,19 @@ class Optimization:
 
     @staticmethod
     def of(
-        found: Design, for_: str, wanted: Mapping[str, Operand], where: Conditions
+        found: Design,
+        for_: str,
+        wanted: Mapping[str, Operand],
+        held: Mapping[str, Operand],
+        where: Conditions,
     ) -> Optimization:
         """Return the record of a design.
 
         Args:
             found: the design.
             for_: kind of the merit.
-            wanted: the operands, by their kinds.
+            wanted: the operands that were asked for, by their kinds.
+            held: those of `gaps_that_stay`, which are told where they bind.
             where: the fields and wavelengths of the merit.
         """
         start, end = found.before, found.after
@@ -129,9 +136,11 @@ class Optimization:
             (math.sqrt(squares[0]), math.sqrt(squares[1])) if for_ in _MEANS else squares,
             tuple(
                 OperandChange(
-                    one.label, _text(one.label, wanted), first.value, one.value, one.deviation
+                    one.label, _text(one.label, {**wanted, **held}), *values, one.deviation
                 )
                 for first, one in zip(start.operands, end.operands, strict=True)
+                if (values := (first.value, one.value))
+                and (one.deviation or not held.keys() & set(one.label.split("/")[:2]))
             ),
             tuple(
                 VariableChange(
@@ -240,6 +249,29 @@ _GAPS = ("centre_thickness", "air_gap", "edge_thickness", "edge_air_gap")
 _CHANGE = 0.01
 
 
+def gaps_that_stay(
+    lens: Lens, wanted: Mapping[str, Operand], object_distance: float | None
+) -> dict[str, Operand]:
+    """Return limits of glass and air, on the axis and at the edges, that nobody asked for, by their
+    kinds: half of the least that the lens has.
+
+    Args:
+        lens: as it is.
+        wanted: what was asked for; its kinds are left out, and those that are negative already.
+        object_distance: mm; None for infinity.
+    """
+    kinds = [Operand(kind, min=0.0) for kind in _GAPS if kind not in wanted]
+    least: dict[str, float] = {}
+    for one in evaluate_operands(kinds, lens, object_distance).numbers():
+        kind = one.label.split("/")[0]
+        least[kind] = min(one.value, least.get(kind, math.inf))
+    return {
+        kind: Operand(kind, min=0.5 * value, weight=_OF_GAPS)
+        for kind, value in least.items()
+        if value >= 0.0
+    }
+
+
 def _notes(before: Lens, after: Lens, object_distance: float | None) -> Iterator[str]:
     """Yield a sentence for what has become worse: gaps below zero, another F-number."""
     limits = [Operand(kind, min=0.0) for kind in _GAPS]
@@ -253,8 +285,8 @@ def _notes(before: Lens, after: Lens, object_distance: float | None) -> Iterator
         if label not in there:
             kind = label.split("/")[0]
             yield (
-                f"{label} is {value:.3g} mm: nothing kept it above zero, as "
-                f"keep={{'{kind}': (0.5, None)}} would."
+                f"{label} is {value:.3g} mm; keep={{'{kind}': {{'min': 0.5, 'weight': 1e5}}}} "
+                "would hold it above zero."
             )
     first, last = (
         lens.first_order(lens.primary_wavelength, object_distance).working_f_number.abs().item()
