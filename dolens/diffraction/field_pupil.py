@@ -66,7 +66,7 @@ class FieldPupil:
         front: Wavefront,
         weights: Tensor,
         most_samples: int,
-        most_rays: int = _RAYS,
+        rays: int = _RAYS,
     ) -> "FieldPupil":
         """Choose how light is propagated, by wavefronts of 32 rays a side or more.
 
@@ -76,7 +76,7 @@ class FieldPupil:
             front: W wavefronts.
             weights: (W,).
             most_samples: across the pupil, beyond which rays alone are used.
-            most_rays: of these, along each side of the beam.
+            rays: of these, along each side of the beam; none leaves those of `front`.
         """
         fit = fit_pupil(front, _DEGREES[0])
         if not bool((fit.residual <= _RESIDUAL).all()):
@@ -85,9 +85,10 @@ class FieldPupil:
         reason = found._obstacle(most_samples)
         if not reason:
             return replace(found, reason="Fourier transform of the pupil")
-        # An infinite sphere is met by all rays, however far they land from its centre.
-        rays = pupil_wavefront(system, point, front.wavelength, front.centre, most_rays, math.inf)
-        return cls(rays, weights, None, f"rays alone: {reason}")
+        if rays:
+            # An infinite sphere is met by all rays, however far they land from its centre.
+            front = pupil_wavefront(system, point, front.wavelength, front.centre, rays, math.inf)
+        return cls(front, weights, None, f"rays alone: {reason}")
 
     @property
     def diffraction(self) -> bool:

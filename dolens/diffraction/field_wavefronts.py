@@ -104,8 +104,7 @@ def object_points(fields: Tensor, object_distance: float | None) -> ObjectPoints
 
 # Samples across the pupil beyond which rays alone make the image: a spot of some 70 Airy radii.
 _MOST_SAMPLES = 512
-# Of a draft: such samples, and rays along each side of a beam where rays alone make the image.
-_DRAFT_SAMPLES, _DRAFT_RAYS = 384, 128
+_DRAFT_SAMPLES = 384
 
 
 @dataclass(frozen=True)
@@ -128,10 +127,10 @@ def prepare_pupils(
     """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
 
     Wavefronts that need more samples across the pupil than `most_samples` are left to rays; of a
-    draft those that need more than 384 are, and the rays are fewer.
+    draft those that need more than 384 are, and no rays are traced for them.
     """
     found = field_wavefronts(lens, where.that_count())
-    settings = (min(most_samples, _DRAFT_SAMPLES), _DRAFT_RAYS) if draft else (most_samples,)
+    settings = (min(most_samples, _DRAFT_SAMPLES), 0) if draft else (most_samples,)
     return PreparedPupils(found, _field_pupils(lens, found, *settings))
 
 

@@ -8,13 +8,15 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
-from dolens.analysis.modulation_transfer import field_directions
+from dolens.analysis.modulation_transfer import field_directions, modulation
 from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.optics.lens import Lens
 
 # Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.
 _MOST_SAMPLES = 1024
+# Of each spot of a draft.
+_DRAFT_RAYS = 2000
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ def diffraction_modulation(
     Rarely needed:
         prepared: `prepare_pupils` of the same arguments, where several analyses share it.
         draft: leave out the second computation, which knows the sampling error, and leave spots of
-            more than some 50 Airy radii to 128 × 128 rays.
+            more than some 50 Airy radii to the rays of `analysis.modulation_transfer.modulation`,
+            2000 for each wavelength.
     """
     prepared = prepared or prepare_pupils(lens, where, _MOST_SAMPLES, draft)
     found, pupils = prepared.wavefronts, prepared.pupils
@@ -77,9 +80,14 @@ def diffraction_modulation(
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
     along = field_directions(found.where).to(lens.device)
     rows, errors = [], []
-    for pupil, way in zip(pupils, along, strict=True):
+    by_rays = _by_rays(lens, prepared, frequency) if draft else {}
+    for number, (pupil, way) in enumerate(zip(pupils, along, strict=True)):
         if pupil is None:
             rows.append(dark)
+            errors.append(math.nan)
+            continue
+        if number in by_rays:
+            rows.append(torch.cat([by_rays[number], dark[:2]]))
             errors.append(math.nan)
             continue
         found_here, limit = pupil.transfer(frequency, way)
@@ -102,3 +110,14 @@ def diffraction_modulation(
         torch.tensor(errors, dtype=torch.float64),
         draft,
     )
+
+
+def _by_rays(lens: Lens, prepared: PreparedPupils, frequency: Tensor) -> dict[int, Tensor]:
+    """Return tangential and sagittal curves (2, Q) of the fields that diffraction is no part of."""
+    pupils, where = prepared.pupils, prepared.wavefronts.where
+    numbers = [n for n, pupil in enumerate(pupils) if pupil and not pupil.diffraction]
+    if not numbers:
+        return {}
+    found = modulation(lens, where.at(where.fields[numbers]), frequency, _DRAFT_RAYS)
+    curves = torch.stack((found.tangential, found.sagittal), 1).to(frequency)
+    return dict(zip(numbers, curves, strict=True))
