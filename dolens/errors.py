@@ -7,6 +7,7 @@ message has the same form and offers the nearest allowed name.
 import difflib
 import re
 from collections.abc import Iterable
+from typing import Any
 
 # Letters of a message, and of a word that is worth comparing with others.
 _LONGEST = 500
@@ -102,6 +103,16 @@ def check_choice(value: object, allowed: Iterable[str], where: str) -> None:
             f"{where}: '{value}' is unknown{did_you_mean(str(value), allowed)} "
             f"(allowed: {', '.join(allowed) or 'none'})"
         )
+
+
+def check_count(key: str, number: Any, least: int = 1) -> None:
+    """Refuse what is no integer of `least` or more.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not (type(number) is int and number >= least):
+        raise InputError(f"{key}: {number!r}; allowed: an integer of {least} or more")
 
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:

@@ -12,8 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from torch.utils.data import DataLoader
 
-from dolens.errors import InputError
-from dolens.experiments.settings import check_count
+from dolens.errors import InputError, check_count
 from dolens.experiments.tables import Row, write_table
 from dolens.optics.lens import Lens
 

@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
 
@@ -92,16 +92,6 @@ def numbers_of(key: str, values: Any, count: int | None = None) -> list[float]:
     if count is not None and len(numbers) != count:
         raise InputError(f"{key}: {count} numbers are needed, not {len(numbers)}")
     return numbers
-
-
-def check_count(key: str, number: Any, least: int = 1) -> None:
-    """Refuse what is no integer of `least` or more.
-
-    Raises:
-        InputError: it is none.
-    """
-    if not (type(number) is int and number >= least):
-        raise InputError(f"{key}: {number!r}; allowed: an integer of {least} or more")
 
 
 def check_positive(key: str, number: Any) -> None:

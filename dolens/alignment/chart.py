@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.gaussian_filters import blurred, weights_on_grid
-from dolens.errors import InputError, check_choice
+from dolens.errors import InputError, check_choice, check_count
 from dolens.optics.elements import rotation_matrix
 
 DISC, SQUARE = "disc", "square"
@@ -52,9 +52,7 @@ class Chart:
     def __post_init__(self) -> None:
         check_choice(self.shape, SHAPES, "chart.shape")
         for key in ("rows", "columns"):
-            number = getattr(self, key)
-            if not (type(number) is int and number >= 1):
-                raise InputError(f"chart.{key}: {number!r}; allowed: an integer of 1 or more")
+            check_count(f"chart.{key}", getattr(self, key))
         for key in ("distance", "pitch", "size"):
             number = getattr(self, key)
             if not 0.0 < number < math.inf:

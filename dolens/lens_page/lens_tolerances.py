@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dolens.analysis.conditions import Conditions, conditions
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count, check_keys
 from dolens.lens_page.offenders import Offenders, Source, bright_fields, tolerances_of
 from dolens.lens_page.overview import prepared_lens
 from dolens.lens_page.tables import Table, number
@@ -27,6 +27,7 @@ from dolens.tolerancing import (
     share_within,
     spots_over_field,
 )
+from dolens.views.overview import as_lens
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -227,11 +228,8 @@ class ToleranceMethods:
             >>> made.table(3).rows[0][0]
             'element 3–4 tilt x'
         """
-        from dolens.errors import check_keys
-
-        for name, value, least in (("lenses", lenses, 1), ("seed", seed, 0)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise InputError(f"{name}: {value!r}; allowed: an integer of {least} or more")
+        check_count("lenses", lenses)
+        check_count("seed", seed, 0)
         allowed = ("f_number", "entrance_pupil_diameter")
         check_keys(aperture, allowed, "tolerances()")
         points: Any = fields
@@ -252,8 +250,3 @@ class ToleranceMethods:
         found = analyse_tolerances(lens, spots, given, weights, lenses, generator)
         worst = Offenders(given, found.sensitivities, found.contributions, notes)
         return LensTolerances(lens, worst, found, weights, where, tuple(problems))
-
-
-def as_lens(methods: Any) -> Lens:
-    """Return the lens whose methods these are."""
-    return methods

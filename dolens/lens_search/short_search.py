@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolens.errors import InputError, check_keys
+from dolens.errors import InputError, check_count, check_keys
 from dolens.lens_page.tables import number
 from dolens.lens_search.finds import Finds, course_picture, starts_and_designs
 from dolens.lens_search.form_report import FormReport, report_form, write_form
@@ -230,8 +230,7 @@ def search(
 def check_amounts(starts: int, forms: int, seed: int, seconds: float | None) -> None:
     """Refuse amounts out of range; see `search`."""
     for name, value, least in (("starts", starts, 1), ("forms", forms, 1), ("seed", seed, 0)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise InputError(f"{name}: {value!r}; allowed: an integer of {least} or more")
+        check_count(name, value, least)
     if seconds is not None and not (isinstance(seconds, int | float) and seconds > 0.0):
         raise InputError(f"seconds: {seconds!r}; allowed: a positive number, or None")
 

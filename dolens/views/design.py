@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from dolens.errors import InputError, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_count, check_keys
 from dolens.views.overview import as_lens
 
 if TYPE_CHECKING:
@@ -79,8 +79,7 @@ class DesignViews:
         check_choice(for_, (*RESIDUALS, *LOSSES), "for_")
         known = set(MeritSettings.__dataclass_fields__) - {"quality", "operands"}
         check_keys(merit, sorted(known), "optimize()")
-        if not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 1:
-            raise InputError(f"iterations: {iterations!r}; allowed: an integer of 1 or more")
+        check_count("iterations", iterations)
         settings = MeritSettings(
             quality=for_,
             fields=None if fields is None else field_points(fields).tolist(),

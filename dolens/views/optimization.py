@@ -125,7 +125,7 @@ class Optimization:
             held: those of `gaps_that_stay`, which are told where they bind.
             where: the fields and wavelengths of the merit.
         """
-        start, end = found.before, found.after
+        start, end, kinds = found.before, found.after, {**wanted, **held}
         squares = (start.quality or 0.0, end.quality or 0.0)
         return Optimization(
             start.lens,
@@ -136,11 +136,10 @@ class Optimization:
             (math.sqrt(squares[0]), math.sqrt(squares[1])) if for_ in _MEANS else squares,
             tuple(
                 OperandChange(
-                    one.label, _text(one.label, {**wanted, **held}), *values, one.deviation
+                    one.label, _text(one.label, kinds), first.value, one.value, one.deviation
                 )
                 for first, one in zip(start.operands, end.operands, strict=True)
-                if (values := (first.value, one.value))
-                and (one.deviation or not held.keys() & set(one.label.split("/")[:2]))
+                if one.deviation or _kind(one.label, kinds) in wanted
             ),
             tuple(
                 VariableChange(
@@ -302,10 +301,14 @@ def _bound(variable: VariableChange) -> float:
     return variable.lower if below <= above else variable.upper
 
 
+def _kind(label: str, wanted: Mapping[str, Operand]) -> str:
+    """Return the kind of the operand that a label is of, behind a state's name or not."""
+    return next(kind for kind in label.split("/")[:2] if kind in wanted)
+
+
 def _text(label: str, wanted: Mapping[str, Operand]) -> str:
     """Return the target or the limits of the operand that a label is of."""
-    parts = label.split("/")
-    one = next(one for kind, one in wanted.items() if kind in parts[:2])
+    one = wanted[_kind(label, wanted)]
     if one.target is not None:
         return f"{one.target:g}"
     if one.max is None:

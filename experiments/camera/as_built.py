@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError, check_choice
+from dolens.errors import InputError, check_choice, check_count
 from dolens.experiments.camera.views.base import Imaging, seed_of
-from dolens.experiments.settings import check_count, check_positive
+from dolens.experiments.settings import check_positive
 from dolens.optics.lens import Lens
 from dolens.sensor.noise import generator_of, noisy_point_spread_functions
 from dolens.tolerancing import (

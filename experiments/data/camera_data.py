@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.data.crop_loading import (
     CropLoader,
     EvaluationCrops,
@@ -18,7 +18,6 @@ from dolens.experiments.data.crop_loading import (
     Waiting,
 )
 from dolens.experiments.data.photographs import Photograph
-from dolens.experiments.settings import check_count
 
 Split = Literal["train", "validation", "test"]
 

@@ -13,11 +13,10 @@ from typing import Any, get_args
 import torch
 from torch.nn.functional import avg_pool2d
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.data.camera_data import CropDataModule, Split
 from dolens.experiments.data.crops import linear_light
 from dolens.experiments.data.photographs import EXTENSIONS, Photograph, read_photograph
-from dolens.experiments.settings import check_count
 from dolens.experiments.tables import read_table
 from dolens.sensor.colour import linear_to_srgb
 

@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.experiment import Analysis, Figures
@@ -27,7 +27,6 @@ from dolens.experiments.lens_search.rungs import (
 from dolens.experiments.lens_search.search import LensSearchModule
 from dolens.experiments.lens_search.trained_camera import CameraTask, train_camera
 from dolens.experiments.running.finished_run import load_run
-from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.lens_search.search import SearchPlan

@@ -11,10 +11,9 @@ import torch
 
 from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.camera.photograph_scores import PhotographScores, paired_gain, read_scores
 from dolens.experiments.lens_search.trained_camera import TrainedCamera, stage_of
-from dolens.experiments.settings import check_count
 from dolens.experiments.tables import read_table
 from dolens.prescriptions import load_lens
 from dolens.reconstruction.quality import Interval

@@ -13,7 +13,7 @@ import torch
 
 from dolens.analysis.conditions import conditions
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.lens_search.found_forms import (
     check_rows,
@@ -22,7 +22,6 @@ from dolens.experiments.lens_search.found_forms import (
     search_figures,
     write_forms_page,
 )
-from dolens.experiments.settings import check_count
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.files import written_whole

@@ -15,11 +15,11 @@ from dolens.alignment.image_losses import SpotLoss
 from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Light, Measurement
 from dolens.alignment.pose import Pose
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.poses.bench import Bench, draw, simulate
 from dolens.experiments.poses.fit_plan import Stage, plain_imager, spot_imager, stage_of
 from dolens.experiments.poses.fitting import iterate, loss_of, optimizer_of
-from dolens.experiments.settings import check_count, check_not_negative, check_positive
+from dolens.experiments.settings import check_not_negative, check_positive
 from dolens.experiments.tables import Row
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor

@@ -14,7 +14,7 @@ from dolens.alignment.chart_model import ChartModel, ChartRays
 from dolens.alignment.chart_photons import ChartLight
 from dolens.alignment.spot_moments import one_thread
 from dolens.analysis.fields_and_wavelengths import spectral_shares
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.bench import check_precision
 from dolens.experiments.poses.chart_restoration import Judged, judged
@@ -45,7 +45,7 @@ from dolens.experiments.poses.chart_simulation import (
     spread_evenly,
     with_numbers,
 )
-from dolens.experiments.settings import PupilRays, check_count, numbers_of
+from dolens.experiments.settings import PupilRays, numbers_of
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.system import require_plane_sensor

@@ -15,8 +15,8 @@ from dolens.alignment.chart_model import BLUR, LARGER, ChartModel, plane_error
 from dolens.alignment.chart_photons import ChartLight, TrueCamera, photographed
 from dolens.alignment.measurement import read_measurement
 from dolens.alignment.unmodelled import Unmodelled
-from dolens.errors import InputError
-from dolens.experiments.settings import check_count, check_not_negative, check_positive, numbers_of
+from dolens.errors import InputError, check_count
+from dolens.experiments.settings import check_not_negative, check_positive, numbers_of
 from dolens.optics.lens import Lens
 from dolens.sensor.noise import generator_of
 from dolens.tolerancing import Tolerances

@@ -23,7 +23,7 @@ from dolens.alignment.element_fit import (
 )
 from dolens.alignment.moments import Pixels, grid_error
 from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
-from dolens.errors import InputError, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_count, check_keys
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.poses.alignment_result import (
     COLUMNS,
@@ -32,7 +32,7 @@ from dolens.experiments.poses.alignment_result import (
     Setup,
     alignment_figure,
 )
-from dolens.experiments.settings import PupilRays, Spots, check_count, check_finite, check_positive
+from dolens.experiments.settings import PupilRays, Spots, check_finite, check_positive
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_names import DEGREE, unit_factors, unit_of

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 from torch.utils.data import DataLoader, Dataset
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.camera.camera import CameraModule
 from dolens.experiments.data.crop_loading import ResumableSampler
 from dolens.experiments.data.package_photographs import PackagePhotographsDataModule
@@ -26,7 +26,6 @@ from dolens.experiments.data.pretraining_photographs import (
 from dolens.experiments.experiment import EXACT, MIXED, Experiment
 from dolens.experiments.pretraining.random_cameras import function_bank
 from dolens.experiments.pretraining.random_pupils import Draw
-from dolens.experiments.settings import check_count
 from dolens.reconstruction.general import GeneralRestoration, Prepared, prepared
 from dolens.reconstruction.wiener import transfer_function
 from dolens.sensor.colour import PATTERNS, linear_to_srgb, srgb_to_linear

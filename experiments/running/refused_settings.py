@@ -24,9 +24,9 @@ from hydra.core.override_parser.types import Override
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError, check_keys
+from dolens.errors import InputError, check_count, check_keys
 from dolens.experiments.running.run_files import walk
-from dolens.experiments.settings import check_count, check_not_negative, check_positive
+from dolens.experiments.settings import check_not_negative, check_positive
 from dolens.typed_values import check_type, parameters_of
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from dolens.errors import InputError, check_choice, did_you_mean
-from dolens.experiments.settings import check_count
+from dolens.errors import InputError, check_choice, check_count, did_you_mean
 from dolens.typed_values import check_type, parameters_of
 
 logger = logging.getLogger(__name__)

@@ -13,9 +13,8 @@ from unittest import mock
 import torch
 from matplotlib.figure import Figure
 
-from dolens.errors import check_choice
+from dolens.errors import check_choice, check_count
 from dolens.experiments.experiment import Analysis, Figures
-from dolens.experiments.settings import check_count
 from dolens.experiments.speed.renders import (
     Subject,
     by_turns,

@@ -14,7 +14,7 @@ from typing import Any
 
 from hydra.core.utils import JobReturn
 
-from dolens.errors import InputError, check_choice, one_line
+from dolens.errors import InputError, check_choice, check_count, one_line
 from dolens.experiments.running.process_settings import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.workers import joined_cluster, local_cluster
@@ -246,8 +246,7 @@ def _shared_out(
     jobs: Sequence[SweepJob], executor: Any, most: int
 ) -> Iterator[tuple[SweepJob, JobReturn]]:
     """Run jobs by an executor of this machine, so that jobs at once times threads are its cores."""
-    if type(most) is not int or most < 1:
-        raise InputError(f"hydra.launcher.array_parallelism: {most!r}; allowed: a number of jobs")
+    check_count("hydra.launcher.array_parallelism", most)
     cores = allowed_processors()
     share = share_of(jobs, min(most, max(1, cores // (given_threads(jobs) or 1))), cores)
     waiting = deque(jobs)

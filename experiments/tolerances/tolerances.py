@@ -12,9 +12,9 @@ from torch import Tensor
 
 from dolens.analysis.conditions import field_shares
 from dolens.analysis.fields_and_wavelengths import spectral_shares
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.experiment import Analysis, Figures
-from dolens.experiments.settings import Spots, check_count, numbers_of
+from dolens.experiments.settings import Spots, numbers_of
 from dolens.experiments.tables import Row
 from dolens.experiments.tolerances.tolerance_report import (
     monte_carlo_rows,
