@@ -46,6 +46,11 @@ ALLOWED = {
         *("errors", "files", "html", "optics", "prescriptions", "analysis", "diffraction"),
         *("tolerancing", "plotting", "views"),
     },
+    # Pages that this machine serves: a lens with sliders, and runs as they go.
+    "live": {
+        *("errors", "files", "html", "optics", "prescriptions", "sensor", "analysis"),
+        *("diffraction", "rendering", "optimize", "plotting", "views", "lens_page"),
+    },
     "manufacturing": {"errors", "files", "optics", "prescriptions", "tolerancing", "plotting"},
     # A search for lenses begins with paraxial optics, and ends with files and a page.
     "lens_search": {
