@@ -16,17 +16,19 @@ ALLOWED = {
     "files": {"errors"},
     "tasks": {"errors"},
     "threads": set(),
+    # A page of photographs knows tensors alone.
+    "photograph_page": {"errors", "files", "html"},
     "cached_tensors": set(),
     "kernels": {"cached_tensors", "errors", "files", "tasks"},
     "optics": {"cached_tensors", "errors", "files", "html", "kernels"},
     "prescriptions": {"errors", "files", "optics"},
-    "sensor": {"errors", "optics"},
+    "sensor": {"errors", "optics", "photograph_page"},
     "scene": {"errors", "optics", "sensor"},
     "analysis": {"errors", "optics", "scene", "sensor"},
     "diffraction": {"errors", "optics", "scene", "sensor", "analysis"},
     "rendering": {
         *("cached_tensors", "errors", "tasks", "optics", "kernels", "scene", "sensor"),
-        *("analysis", "diffraction"),
+        *("analysis", "diffraction", "photograph_page"),
     },
     # Bounded steps of thousands of lenses are a kernel.
     "optimize": {"errors", "typed_values", "kernels", "optics", "analysis", "rendering"},
@@ -35,7 +37,7 @@ ALLOWED = {
         *("errors", "typed_values", "optics", "sensor", "rendering", "analysis", "diffraction"),
         "optimize",
     },
-    "reconstruction": {"errors", "optics", "sensor", "rendering"},
+    "reconstruction": {"errors", "optics", "sensor", "rendering", "photograph_page"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
     "views": {
         *("errors", "optics", "sensor", "analysis", "diffraction", "rendering", "plotting"),

@@ -76,6 +76,21 @@ def structural_similarity(restored: Tensor, truth: Tensor) -> Tensor:
     return total / height
 
 
+def scores_of(image: Tensor, truth: Tensor, prefix: str = "") -> dict[str, float]:
+    """Return `psnr_db` and `ssim` of an image (3, H, W), sRGB values, each name behind a prefix.
+
+    Args:
+        image: H and W at least 11.
+        truth: the same shape.
+        prefix: as `raw_`.
+    """
+    pair = image[None], truth[None].to(image)
+    return {
+        f"{prefix}psnr_db": float(psnr_db(*pair)),
+        f"{prefix}ssim": float(structural_similarity(*pair)),
+    }
+
+
 def _check_shapes(restored: Tensor, truth: Tensor) -> None:
     if restored.shape != truth.shape or restored.ndim != 4:
         raise ValueError(

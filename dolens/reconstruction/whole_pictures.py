@@ -8,6 +8,7 @@ it sees the mirror image.  Memory is that of a window, but for the picture itsel
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -16,7 +17,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.photograph_page.page import ShownPhotograph
 from dolens.reconstruction.general import GeneralRestoration
+from dolens.reconstruction.quality import psnr_db
 from dolens.rendering.photograph import Photograph
 from dolens.sensor.display import Picture
 from dolens.sensor.readout import Readout
@@ -36,9 +39,30 @@ Restorer = Callable[[Tensor, Tensor, None, Tensor], Tensor]
 Illumination = Callable[[Tensor, Tensor], Tensor]
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class RestoredPicture(Picture):
+    """A `RestoredPicture` is made of a photograph; it shows itself in a notebook.
+
+    Attributes:
+        sensor: the sensor's image that it was restored from, (3, H, W), sRGB values from 0 to 1.
+    """
+
+    sensor: Tensor
+
+    def shown(self, name: str) -> ShownPhotograph:
+        """Return it as a page has it, by a name, beside truth and sensor image, with their PSNR."""
+        pictures = {"truth": self.truth, "sensor": self.sensor, "restored": self.image}
+        scores = {
+            f"{label} PSNR, dB": float(psnr_db(image[None], self.truth[None]))
+            for label, image in pictures.items()
+            if image is not self.truth
+        }
+        return ShownPhotograph(name, pictures, scores)
+
+
 def restore(
     photograph: Photograph, restorer: Restorer | None = None, window: int | None = None
-) -> Picture:
+) -> RestoredPicture:
     """Restore a photograph by a network that is told the point spread functions and the noise.
 
     Nothing is trained: one network that comes with dolens restores for any lens, see
@@ -52,7 +76,7 @@ def restore(
     >>> photo = dolens.load_lens("cooke_triplet").photograph(grey)
     >>> restored = dolens.restore(photo)
     >>> restored
-    Picture of 64×48 pixels
+    RestoredPicture of 64×48 pixels
     >>> error = dolens.reconstruction.mean_squared_error
     >>> bool(error(restored.image, restored.truth) < error(photo.image, photo.truth) / 100)
     True
@@ -66,7 +90,8 @@ def restore(
             its change over the field allows.
 
     Returns:
-        `image` and `truth` (3, H, W), sRGB from 0 to 1; `save(path)`; it shows itself in a
+        `image` and `truth` (3, H, W), sRGB from 0 to 1; `save(path)`, of which a path that ends in
+        .html is a page with a slider between truth, sensor image and it; it shows itself in a
         notebook.
 
     Raises:
@@ -84,7 +109,7 @@ def restore(
         photograph.illumination,
         photograph.camera.field.window() if window is None else window,
     )
-    return Picture(found.clamp_(0.0, 1.0), photograph.truth)
+    return RestoredPicture(found.clamp_(0.0, 1.0), photograph.truth, photograph.image)
 
 
 @cache

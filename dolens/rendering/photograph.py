@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
+from dolens.photograph_page.page import ShownPhotograph
 from dolens.rendering.lens_camera import colours_of, distance_of, required_number
 from dolens.rendering.whole_field import WholeField
 from dolens.scene.planar import PlanarScene
@@ -60,6 +61,10 @@ class Photograph(Picture):
     def illumination(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return relative illumination at rows (N,) and columns (M,), pixels: (3, N, M)."""
         return self.camera.field.illumination(rows, columns)
+
+    def shown(self, name: str) -> ShownPhotograph:
+        """Return it as a page has it, by a name, beside its truth."""
+        return ShownPhotograph(name, {"truth": self.truth, "sensor": self.image})
 
     def __repr__(self) -> str:
         """Return size, distance and noise as text."""

@@ -14,13 +14,14 @@ from PIL import Image
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.photograph_page.page import PhotographPage, ShownPhotograph
 from dolens.sensor.colour import srgb_to_linear
 from dolens.sensor.image_files import MEGAPIXELS
 from dolens.sensor.pictures import Pixels, read_pixels
 
 logger = logging.getLogger(__name__)
 
-_TIFF = (".tif", ".tiff")
+_TIFF, _PAGE = (".tif", ".tiff"), ".html"
 _PNG_COLOURS = {1: 0, 3: 2}
 _ROWS = 256
 # Pixels along the longer side of what a notebook shows.
@@ -43,19 +44,29 @@ class Picture:
         """Write the image; missing folders are created.
 
         Args:
-            path: ends in .png, .tif or .tiff.
-            bits: 8 or 16.
+            path: ends in .png, .tif or .tiff; or in .html: a page that compares it with the truth,
+                by a slider and a magnifier.
+            bits: 8 or 16; a page has 8.
 
         Raises:
             InputError: another ending, or other bits.
         """
         path = Path(path).expanduser()
-        if path.suffix.lower() not in (".png", *_TIFF):
-            raise InputError(f"{path}: allowed endings of a picture: .png, .tif, .tiff")
+        if path.suffix.lower() not in (".png", *_TIFF, _PAGE):
+            raise InputError(f"{path}: allowed endings of a picture: .png, .tif, .tiff, .html")
         if bits not in (8, 16):
             raise InputError(f"bits: {bits}; allowed: 8, 16")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_picture(path, self.image, bits)
+        if path.suffix.lower() == _PAGE:
+            page = PhotographPage(1)
+            page.add(self.shown(path.stem))
+            page.write(path, path.stem, [repr(self)])
+        else:
+            write_picture(path, self.image, bits)
+
+    def shown(self, name: str) -> ShownPhotograph:
+        """Return it as a page has it, by a name, beside what it is compared with."""
+        return ShownPhotograph(name, {"truth": self.truth, "picture": self.image})
 
     def __repr__(self) -> str:
         """Return the size as text."""

@@ -1,5 +1,9 @@
-"""Photographs of a validation are logged as pictures, and scores of a test as tables."""
+"""Photographs of a validation are logged as pictures, those of a test are written as a page and
+their scores as tables.
+"""
 
+import logging
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,25 +13,65 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_count
 from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.camera_figures import view_name
 from dolens.experiments.camera.photograph_scores import table_name
-from dolens.experiments.camera.reconstruction import evaluating
-from dolens.experiments.camera.views.base import Shot
 from dolens.experiments.data.photographs import shown_name
 from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.experiments.tables import write_table
+from dolens.photograph_page.page import PAGE, PhotographPage, ShownPhotograph, shown_scores
 from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import gathered
+from dolens.reconstruction.quality import scores_of
 from dolens.sensor.colour import linear_to_srgb
-from dolens.tasks import stage
+
+logger = logging.getLogger(__name__)
 
 _GAP, _TEXT = 4, 15  # pixels between pictures, and of the line of text above them
 # Wider pictures are cut to their middle: a log is no archive.
 _WIDEST = 256
 
 
-class ValidationPictures(lightning.Callback):
+class _ChosenCrops(lightning.Callback):
+    """Looks at the first crops of some photographs, spread over all of a stage."""
+
+    def __init__(self, photographs: int) -> None:
+        self.photographs = photographs
+        self._crops: dict[int, str] = {}
+
+    def _choose(self, names: Sequence[str]) -> None:
+        """Choose the crops, which have the names of their photographs."""
+        first: dict[str, int] = {}
+        for crop, name in enumerate(names):
+            first.setdefault(name, crop)
+        found = list(first)
+        count = min(self.photographs, len(found))
+        chosen = [found[(2 * n + 1) * len(found) // (2 * count)] for n in range(count)]
+        self._crops = {first[name]: name for name in chosen}
+
+    def _seen(
+        self, trainer: lightning.Trainer, camera: Camera, stage: str, batch: Tensor, index: int
+    ) -> Iterator[tuple[int, str, str, tuple[Tensor, Tensor, Tensor]]]:
+        """Yield number, photograph, view and images of the chosen crops in a batch.
+
+        The images are truth, sensor's image and restored image, (3, H, W), display-encoded.
+        """
+        number = camera.evaluation_batch(stage, index)
+        first = number * getattr(trainer.datamodule, "batch_size", len(batch))
+        chosen = {n: self._crops[first + n] for n in range(len(batch)) if first + n in self._crops}
+        seen = getattr(camera, "seen", None)
+        if not chosen or seen is None:
+            return
+        taken, restored = seen
+        images = (taken.truth, linear_to_srgb(taken.raw), restored.clamp(0.0, 1.0))
+        for crop, photograph in chosen.items():
+            for view, label in enumerate(camera.views.labels()):
+                truth, raw, found = (image[crop, view].float().cpu() for image in images)
+                yield first + crop, shown_name(photograph), label, (truth, raw, found)
+
+
+class ValidationPictures(_ChosenCrops):
     """Logs truth, sensor's image and restored image side by side, with their PSNR.
 
     The pictures are called `<photograph>/<view>`, as `chelsea/8m`; each shows the same crop
@@ -47,8 +91,8 @@ class ValidationPictures(lightning.Callback):
                 raise InputError(
                     f"callbacks.validation_pictures: {name} {value}; allowed: 1 or more"
                 )
-        self.photographs, self.times = photographs, times
-        self._crops: dict[int, str] = {}
+        super().__init__(photographs)
+        self.times = times
         self._found: list[_Picture] = []
 
     def on_validation_start(
@@ -58,15 +102,8 @@ class ValidationPictures(lightning.Callback):
         self._crops, self._found = {}, []
         find = getattr(trainer.datamodule, "evaluation_photographs", None)
         kept = any(isinstance(entry, TakesPictures) for entry in trainer.loggers)
-        if find is None or not kept or trainer.sanity_checking or not self._due(trainer):
-            return
-        first: dict[str, int] = {}
-        for crop, name in enumerate(find("validation")):
-            first.setdefault(name, crop)
-        names = list(first)
-        count = min(self.photographs, len(names))
-        chosen = [names[(2 * n + 1) * len(names) // (2 * count)] for n in range(count)]
-        self._crops = {first[name]: name for name in chosen}
+        if find is not None and kept and not trainer.sanity_checking and self._due(trainer):
+            self._choose(find("validation"))
 
     def _due(self, trainer: lightning.Trainer) -> bool:
         """Return whether this epoch's validation is among those that pictures are logged of."""
@@ -79,7 +116,6 @@ class ValidationPictures(lightning.Callback):
         number = (epoch + 1) // every
         return number * self.times // validations > (number - 1) * self.times // validations
 
-    @torch.no_grad()
     def on_validation_batch_end(
         self,
         trainer: lightning.Trainer,
@@ -90,23 +126,12 @@ class ValidationPictures(lightning.Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Make the pictures of the chosen crops in this batch."""
-        if not isinstance(pl_module, Camera) or not self._crops:
+        if not isinstance(pl_module, Camera):
             return
-        number = pl_module.evaluation_batch("val", batch_idx)
-        first = number * getattr(trainer.datamodule, "batch_size", len(batch))
-        chosen = {n: self._crops.get(first + n) for n in range(len(batch))}
-        if not any(chosen.values()):
-            return
-        with stage("pictures"), evaluating(pl_module.network):
-            taken, functions = pl_module.take(pl_module.variables(), Shot(batch, "val", number))
-            restored = pl_module.restore(taken, functions).clamp(0.0, 1.0).float().cpu()
-        truth, raw = taken.truth.float().cpu(), linear_to_srgb(taken.raw).float().cpu()
-        for crop, photograph in chosen.items():
-            for view, label in enumerate(pl_module.views.labels()):
-                if photograph is not None:
-                    images = (truth[crop, view], raw[crop, view], restored[crop, view])
-                    name = f"{shown_name(photograph)}/{label}"
-                    self._found.append(_picture(first + crop, name, *images))
+        for crop, photograph, view, images in self._seen(
+            trainer, pl_module, "val", batch, batch_idx
+        ):
+            self._found.append(_picture(crop, f"{photograph}/{view}", *images))
 
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
@@ -171,6 +196,75 @@ def _middle(image: Tensor) -> np.ndarray:
     top, left = (max(size - _WIDEST, 0) // 2 for size in image.shape[-2:])
     cut = image[:, top : top + _WIDEST, left : left + _WIDEST]
     return (cut.permute(1, 2, 0) * 255.0).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+class PhotographsPage(_ChosenCrops):
+    """Writes `photographs.html`: truth, sensor's image and restored image of some test photographs,
+    with a slider between any two of them, a magnifier and their scores.
+
+    Each is shown by its first crop, in every view, with the noise with which the test measures it.
+
+    Args:
+        folder: the run folder.
+        photographs: how many, spread over those of the test; 0: no page.
+
+    Raises:
+        InputError: a negative number.
+    """
+
+    def __init__(self, folder: str, photographs: int = 6) -> None:
+        check_count("callbacks.photographs_page: photographs", photographs, 0)
+        super().__init__(photographs)
+        self.folder = Path(folder)
+        self._found: list[tuple[int, ShownPhotograph]] = []
+
+    def on_test_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Choose the crops; where the data name no photographs, the first ones."""
+        self._crops, self._found = {}, []
+        find = getattr(trainer.datamodule, "evaluation_photographs", None)
+        if self.photographs and isinstance(pl_module, Camera):
+            numbers = [f"photograph {number + 1}" for number in range(self.photographs)]
+            self._choose(numbers if find is None else find("test"))
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: object,
+        batch: Tensor,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep the images of the chosen crops in this batch."""
+        if not isinstance(pl_module, Camera):
+            return
+        for crop, photograph, view, (truth, raw, restored) in self._seen(
+            trainer, pl_module, "test", batch, batch_idx
+        ):
+            scores = scores_of(raw, truth, "raw_") | scores_of(restored, truth)
+            images = {"truth": truth, "sensor": raw, "restored": restored}
+            name = f"{photograph}, {view_name(view)}"
+            self._found.append((crop, ShownPhotograph(name, images, shown_scores(scores))))
+
+    def on_test_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Write the page, with photographs that other processes measured too."""
+        parts, self._found = gathered(self._found), []
+        found = {(crop, entry.name): entry for part in parts for crop, entry in part}
+        if not found or not trainer.is_global_zero:
+            return
+        page = PhotographPage(len(found))
+        for _, entry in sorted(found.items(), key=lambda item: item[0][0]):
+            page.add(entry)
+        title = f"Test photographs of {getattr(pl_module, 'experiment', '') or 'a camera'}"
+        note = "Each is one crop of the sensor's size, and so are its scores; truth is the scene."
+        try:
+            page.write(self.folder / PAGE, title, [note])
+        except OSError as problem:  # the test's numbers are not to be lost with it
+            logger.error("No %s: %s", PAGE, problem)
 
 
 class PhotographTable(lightning.Callback):

@@ -44,7 +44,7 @@ from dolens.experiments.camera.training import (
     parameter_groups,
     summary_numbers,
 )
-from dolens.experiments.camera.views.base import Imaging
+from dolens.experiments.camera.views.base import Imaging, Views
 from dolens.experiments.camera.views.exposures import Exposures
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
@@ -143,6 +143,8 @@ class CameraModule(Camera):
         self.evaluation = Evaluation(miscalibrations)
         self.test_scores: dict[str, PhotographScores] = {}
         self.validation_scores: PhotographScores | None = None  # of the last one
+        # The images and restored images of the last batch that was evaluated, for callbacks.
+        self.seen: tuple[Views, Tensor] | None = None
         self._looked_in_epoch: int | None = None
         self._shown: dict[str, Tensor] = {}  # stage → its first crop, for figures
         # Not for Lightning's strategy to average: discriminators have an optimizer of their own.
@@ -317,7 +319,8 @@ class CameraModule(Camera):
             self._shown[stage] = batch[:1].clone()
         if stage == "test" and self.manufacture is not None:
             self._made_crops.append(batch.clone())
-        self.evaluation.measure(self, batch, stage, self.evaluation_batch(stage, index))
+        number = self.evaluation_batch(stage, index)
+        self.seen = self.evaluation.measure(self, batch, stage, number)
 
     def on_validation_epoch_end(self) -> None:
         """Log the means."""

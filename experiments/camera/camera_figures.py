@@ -74,7 +74,7 @@ def _images(
         mean, count = float(found.mean()), len(found)
         title += f"\n(restored, mean over {count} photographs and all views: {mean:.2f} dB)"
     title += "\ndisplay-encoded (sRGB), clipped to [0, 1], not interpolated"
-    labels = [_label(label) for label in camera.views.labels()]
+    labels = [view_name(label) for label in camera.views.labels()]
     return comparison_figure(truth, raw, restored, labels, quality, title, depths)
 
 
@@ -100,7 +100,7 @@ def _point_spread_functions(camera: Camera) -> Figure:
     optics = optics_text(lens.system(), lens.primary_wavelength, views.object_distance)
     return psf_figure(
         functions.cpu().reshape(-1, *functions.shape[-3:]),  # of readouts one after the other
-        [_label(label) for label in views.psf_labels()],
+        [view_name(label) for label in views.psf_labels()],
         views.sensor.pixel_pitch,
         f"{shown_name(lens)}: {optics}\nPSFs {views.psf_place}",
     )
@@ -151,11 +151,11 @@ def _metres(distance: float) -> str:
     return f"{number_text(distance)} mm"
 
 
-def _label(label: str) -> str:
+def view_name(label: str) -> str:
     """Return `8 m` for the label `8m` of a depth, and `0.7 of the field` for that of a zone."""
     state, _, own = label.rpartition(", ")
     if state:  # of a lens that is exposed in several
-        return f"{state}, {_label(own)}"
+        return f"{state}, {view_name(own)}"
     number = label.removesuffix("m")
     if number.replace(".", "").isdigit():
         return f"{number} m" if number != label else f"{label} of the field"

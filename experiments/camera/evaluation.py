@@ -55,9 +55,17 @@ class Evaluation:
         self._seconds: dict[str, list[float]] = {}
 
     @torch.no_grad()
-    def measure(self, camera: Camera, batch: Tensor, stage: str, index: int) -> None:
-        """Image, restore and compare textures (B, 3, h, w); see `Shot` for the others."""
+    def measure(
+        self, camera: Camera, batch: Tensor, stage: str, index: int
+    ) -> tuple[Views, Tensor]:
+        """Image, restore and compare textures (B, 3, h, w); see `Shot` for the others.
+
+        Returns:
+            The images by the camera's own renderer, and what was restored of them, (B, V, 3, H, W),
+            display-encoded.
+        """
         values = camera.variables()
+        seen: tuple[Views, Tensor] | None = None
         for reference in (None, *camera.views.reference_renderers()):
             started, shot = time.perf_counter(), Shot(batch, stage, index, reference)
             with named_stage(f"judge {reference}") if reference else nullcontext():
@@ -65,7 +73,9 @@ class Evaluation:
             if reference is not None:
                 self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
             name = stage if reference is None else f"{stage}_{reference}"
-            row = _row(camera, taken, camera.restore(taken, functions))
+            restored = camera.restore(taken, functions)
+            seen = seen or (taken, restored)
+            row = _row(camera, taken, restored)
             filtered = camera.filtered(taken, functions) if stage == "test" else None
             if filtered is not None:
                 row["linear_psnr_db"] = _compared(psnr_db, filtered.clamp(0.0, 1.0), taken.truth)
@@ -76,6 +86,8 @@ class Evaluation:
             self._add(name, index, row)
             if reference is None and stage == "test" and functions is not None:
                 self._miscalibrated(camera, values, taken, functions, index)
+        assert seen is not None  # of the camera's own renderer
+        return seen
 
     def _miscalibrated(
         self,

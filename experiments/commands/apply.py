@@ -134,8 +134,8 @@ class PictureCamera:
             "sensor": linear_to_srgb(light if views.readouts is None else light.mean(dim=1))[0],
             "restored": self._restored(signal, taken.field, placing),
         }
-        files, metrics = written(images, signal[0], depth, name, folder, options)
-        return Applied(name, files, metrics, taken.mapping)
+        files, metrics, shown = written(images, signal[0], depth, name, folder, options)
+        return Applied(name, files, metrics, taken.mapping, shown)
 
     def restore(self, file: Path, folder: Path) -> list[Applied]:
         """Restore what a real sensor of this camera gave, and write the picture into a folder.
@@ -226,7 +226,8 @@ def apply_run(
     run = load_run(folder, checkpoint, with_loss=False, trust=trust)
     camera = PictureCamera(run, options)
     each = camera.restore if options.raw else camera.apply
-    return into, camera, apply_to_files(files, into, each, camera.record)
+    found = apply_to_files(files, into, each, camera.record, len(camera.depths()))
+    return into, camera, found
 
 
 def signal_of(

@@ -83,8 +83,11 @@ class AppliedLens:
                 return depth_picture(depth_probabilities(raw, functions, noise), depths)
 
             images["depth"] = restore(photograph, look, window).image
-        made = written(images, photograph.signal, photograph.distance, name, folder, self.options)
-        return Applied(name, *made, f"{camera.description}; restored in windows of {window} pixels")
+        files, metrics, shown = written(
+            images, photograph.signal, photograph.distance, name, folder, self.options
+        )
+        mapping = f"{camera.description}; restored in windows of {window} pixels"
+        return Applied(name, files, metrics, mapping, shown)
 
     def record(self) -> dict[str, Any]:
         """Return what is true of all pictures, for their records."""
@@ -125,4 +128,5 @@ def apply_lens(
     check_files(files)
     camera = AppliedLens(load_lens(lens), options)
     into = Path(f"{Path(lens).stem}_applied" if out is None else out).expanduser().resolve()
-    return into, apply_to_files(files, into, camera.apply, camera.record)
+    depths = len(options.depths) or 1
+    return into, apply_to_files(files, into, camera.apply, camera.record, depths)

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,10 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.experiments.commands.apply_options import PictureOptions
 from dolens.experiments.running.run_files import write_json
+from dolens.photograph_page.page import PAGE, PhotographPage, ShownPhotograph, shown_scores
 from dolens.plotting import save_figure
 from dolens.plotting.pictures import applied_figure
-from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.reconstruction.quality import scores_of
 from dolens.sensor.display import write_picture
 from dolens.sensor.image_files import MEGAPIXELS, format_of, read_numbers
 
@@ -52,12 +53,14 @@ class Applied:
         metrics: PSNR and SSIM of the sensor's image (`raw_…`) and of the restored one; empty where
             there is no truth.
         mapping: how the picture came to lie on the sensor, in words.
+        shown: as the page of all has it; None where there is no truth.
     """
 
     name: str
     files: tuple[Path, ...]
     metrics: Mapping[str, float]
     mapping: str
+    shown: ShownPhotograph | None = None
 
 
 def apply_to_files(
@@ -65,14 +68,16 @@ def apply_to_files(
     into: Path,
     each: Callable[[Path, Path], list[Applied]],
     record: Callable[[], dict[str, Any]],
+    depths: int = 1,
 ) -> list[Applied]:
-    """Apply a camera to files, and write beside the images what became of each.
+    """Apply a camera to files, and write beside the images what became of each, and a page of all.
 
     Args:
         files: of the pictures.
         into: the folder that is written to; it is made.
         each: of a file and that folder: what a camera makes of it.
         record: what is true of all of them, for the record.
+        depths: that each picture is put at.
 
     Raises:
         InputError: the folder cannot be made, or a file not be used.
@@ -82,10 +87,14 @@ def apply_to_files(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"--out: {into}: no folder can be made here ({reason})") from None
-    found = []
+    found: list[Applied] = []
+    page = PhotographPage(len(files) * depths)
     for file in files:
         applied = each(Path(file).expanduser(), into)
-        found += applied
+        for entry in applied:
+            if entry.shown is not None:
+                page.add(entry.shown)
+        found += [replace(entry, shown=None) for entry in applied]  # its images are large
         images = {
             entry.name: {
                 "mapping": entry.mapping,
@@ -97,6 +106,14 @@ def apply_to_files(
         }
         write_json(
             into / f"{Path(file).stem}.json", {"picture": str(file), "images": images, **record()}
+        )
+    if any(entry.metrics for entry in found):
+        told = record()
+        camera = told.get("experiment") or told.get("lens") or "camera"
+        page.write(
+            into / PAGE,
+            f"Photographs through {camera}",
+            list(dict.fromkeys(e.mapping for e in found)),
         )
     return found
 
@@ -148,7 +165,7 @@ def written(
     name: str,
     folder: Path,
     options: PictureOptions,
-) -> tuple[tuple[Path, ...], dict[str, float]]:
+) -> tuple[tuple[Path, ...], dict[str, float], ShownPhotograph]:
     """Measure and write what a camera makes of a picture.
 
     Args:
@@ -161,13 +178,12 @@ def written(
         options: bits and format.
 
     Returns:
-        The files, and PSNR and SSIM.
+        The files, PSNR and SSIM, and the photograph for a page.
     """
     truth, files, metrics = images["truth"], [], {"depth_mm": float(depth)}
     for kind, prefix in (("sensor", "raw_"), ("restored", "")):
         image = images[kind]
-        metrics[f"{prefix}psnr_db"] = float(psnr_db(image[None], truth[None].to(image)))
-        metrics[f"{prefix}ssim"] = float(structural_similarity(image[None], truth[None].to(image)))
+        metrics |= scores_of(image, truth, prefix)
         files.append(folder / f"{name}_{kind}.{options.format}")
         write_picture(files[-1], image, options.bits)
     if "depth" in images:
@@ -181,4 +197,4 @@ def written(
     numbers = {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]}
     files.append(folder / f"{name}_comparison.png")
     save_figure(applied_figure(images, numbers, title), files[-1])
-    return tuple(files), metrics
+    return tuple(files), metrics, ShownPhotograph(title, images, shown_scores(metrics))

@@ -3,9 +3,11 @@
 import base64
 import io
 import math
+import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import quote
 
 from markupsafe import Markup, escape
 from PIL import Image
@@ -14,6 +16,7 @@ from dolens.experiments.report.checks import SOURCES, Check, Material, Outcome, 
 from dolens.experiments.report.plan import Item, Row
 from dolens.experiments.report.runs import Result, shown_command, telling_overrides
 from dolens.html import rendered, shown
+from dolens.photograph_page.page import PAGE as PHOTOGRAPHS
 from dolens.plotting.style import with_minus
 from dolens.sensor.image_files import opened_image
 
@@ -28,8 +31,14 @@ _STATES = (
 _KINDS = {"printed": "printed", "exact": "exact", "measured": "measured", "statement": "claim"}
 
 
-def page(material: Material) -> str:
-    """Return the page as one HTML file without references to other files."""
+def page(material: Material, folder: Path | None = None) -> str:
+    """Return the page as one HTML file, which needs no other files.
+
+    Args:
+        material: what is on it.
+        folder: that the page is written to, from where it links to the photographs of runs; None:
+            it links to none.
+    """
     results = material.results
 
     def cost(name: str, otherwise: str) -> str:
@@ -64,8 +73,19 @@ def page(material: Material) -> str:
             results[picture.run].figure(picture.name) if picture.run in results else None
         ),
         ours=lambda row: ours_text(material, row),
+        photographs=lambda name: (
+            photographs_of(results[name], folder) if folder and name in results else None
+        ),
         version=lambda name: _version(material, name),
     )
+
+
+def photographs_of(result: Result, folder: Path) -> str | None:
+    """Return the address of a run's page of photographs from a folder; None where it has none."""
+    found = result.folder / PHOTOGRAPHS
+    if not found.is_file():
+        return None
+    return quote(Path(os.path.relpath(found.resolve(), folder.resolve())).as_posix())
 
 
 def prose(text: str) -> Markup:

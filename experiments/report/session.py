@@ -169,7 +169,7 @@ def assemble(
     found = outcomes(load_checks(plan), metrics)
     material = Material(plan, results, comparisons, found, failed, _made(), code_fingerprint())
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(page(material), encoding="utf-8")
+    file.write_text(page(material, file.parent), encoding="utf-8")
     return found
 
 

@@ -3,6 +3,7 @@
 import copy
 import io
 import math
+import re
 
 import numpy as np
 import pytest
@@ -116,6 +117,18 @@ def test_files_arrays_and_tensors_are_one_picture(tmp_path):
     assert torch.equal(linear_picture(tensor[:1]), grey)
     rounded = linear_picture(blocks().to(torch.bfloat16))
     assert (rounded - linear_picture(blocks())).abs().max() < 0.02
+
+
+def test_a_restored_picture_is_a_page_beside_its_photograph_and_truth(lens, tmp_path):
+    photo = lens.photograph(blocks())
+    restored = dolens.restore(photo)
+    restored.save(tmp_path / "new/page.html")
+    text = (tmp_path / "new/page.html").read_text()
+    assert re.findall(r'alt="(\w+)"', text) == ["truth", "sensor", "restored"]
+    for picture in (photo, restored):
+        assert f"<td>{decibels(picture):.2f}</td>" in text
+    photo.save(tmp_path / "photo.html")
+    assert re.findall(r'alt="(\w+)"', (tmp_path / "photo.html").read_text()) == ["truth", "sensor"]
 
 
 def test_pictures_are_written_and_show_themselves(lens, tmp_path):

@@ -55,6 +55,7 @@ def test_a_lens_file_images_a_picture_and_restores_it(work):
     folder = work / "triplet_applied"
     assert {p.name for p in folder.iterdir()} == {
         "blocks_sensor.png", "blocks_restored.png", "blocks_comparison.png", "blocks.json",
+        "photographs.html",
     }  # fmt: skip
     record = json.loads((folder / "blocks.json").read_text())
     numbers = record["images"]["blocks"]
@@ -64,6 +65,8 @@ def test_a_lens_file_images_a_picture_and_restores_it(work):
     assert numbers["psnr_db"] > numbers["raw_psnr_db"] + 3.0
     truth, restored = encoded("blocks.png"), encoded(folder / "blocks_restored.png")
     assert restored.shape == truth.shape
+    page = (folder / "photographs.html").read_text()
+    assert f"<td>{numbers['psnr_db']:.2f}</td>" in page and "blocks at infinity" in page
     # The triplet's distortion is less than a pixel here.
     assert float(psnr_db(restored[None], truth[None])) > 15.0
 

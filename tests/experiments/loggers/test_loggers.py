@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.photograph_results import ValidationPictures, side_by_side
+from dolens.experiments.data.photographs import shown_name
 from dolens.experiments.loggers import trackers as history_file
 from dolens.experiments.loggers.protocol import RunSummary, TakesPictures, TakesSummary, summarise
 from dolens.experiments.loggers.trackers import History, TensorBoard
@@ -149,6 +150,17 @@ def test_a_camera_logs_pictures_by_photograph_and_view(two_epochs):
     steps = [int(row["step"]) for row in two_epochs.table("metrics")]
     assert steps == sorted(set(steps))
     assert len([row for row in two_epochs.table("metrics") if row["val/psnr_db"]]) >= 2
+
+
+def test_photographs_of_a_test_are_a_page_with_their_scores(two_epochs):
+    text = (two_epochs.folder / "photographs.html").read_text()
+    rows = [row for row in two_epochs.table("test_photographs") if row["crops"] == "1"]
+    shown = [row for row in rows if f"{shown_name(row['photograph'])}, 6 m<" in text]
+    assert len(shown) >= 3
+    # A photograph of one crop has the crop's scores.
+    for row in shown:
+        for name in ("psnr_db", "raw_psnr_db"):
+            assert f"<td>{float(row[name]):.2f}</td>" in text
 
 
 def test_a_resumed_run_goes_on_at_its_step(trained):

@@ -40,6 +40,15 @@ def text(result):
     return page(Material(PLAN, {"singlet": result}, {}, found, failed, "Made now.", "c0de"))
 
 
+def test_the_page_links_to_photographs_of_a_run(result):
+    given = Material(PLAN, {"singlet": result}, {}, (), {}, "Made now.", "c0de")
+    folder = result.folder.parents[1] / "a report"
+    assert "photographs.html" not in page(given, folder)
+    (result.folder / "photographs.html").write_text("")
+    assert 'href="../runs0/singlet/photographs.html"' in page(given, folder)
+    (result.folder / "photographs.html").unlink()
+
+
 def test_checks_hold_fail_or_were_not_run(result):
     states = [outcome.state for outcome in outcomes(CHECKS, {"singlet": result.metrics})]
     assert states == [State.HOLDS, State.FAILS, State.FAILS, State.NOT_RUN]

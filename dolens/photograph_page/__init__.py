@@ -1,0 +1,1 @@
+"""Photographs on a page, compared by a slider and a magnifier."""
