@@ -40,6 +40,8 @@ def followed(tmp_path, dolens_train):
             for words in commands_of(block) if (block.page, block.language) == (page, "sh") else ():
                 if words[0] == "cd":
                     folder = tmp_path / words[1]
+                elif words[:2] == ["dolens", "new"]:
+                    assert_written_as_printed(tmp_path / "new" / words[2], page)
                 elif folder != tmp_path:
                     assert words[:2] == ["dolens", "train"]
                     dolens_train(folder, *words[2:], *sizes)
@@ -47,6 +49,18 @@ def followed(tmp_path, dolens_train):
         return folder, run
 
     return follow
+
+
+def assert_written_as_printed(folder, page):
+    """`dolens new` writes what a page prints."""
+    ended("new", str(folder))
+    printed = {block.title: block.text for block in BLOCKS if block.page == page and block.title}
+    written = {
+        str(path.relative_to(folder.parent)): path.read_text(encoding="utf-8")
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+    assert written == printed
 
 
 def metrics_of(run):

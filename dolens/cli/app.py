@@ -16,6 +16,8 @@ from dolens.cli.evaluate import evaluate
 from dolens.cli.experiments import experiments
 from dolens.cli.export import export
 from dolens.cli.lens_files import check, convert
+from dolens.cli.doctor import doctor
+from dolens.cli.new import new
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
@@ -75,6 +77,7 @@ def _dolens(
 app.command("show")(show)
 app.command("convert")(convert)
 app.command("check")(check)
+app.command("new")(new)
 app.command("experiments")(experiments)
 app.command("train", cls=PassedOn, add_help_option=False)(train)
 app.command("evaluate")(evaluate)
@@ -82,3 +85,4 @@ app.command("apply")(apply)
 app.command("compare")(compare)
 app.command("export")(export)
 app.command("report", help=REPORT_HELP)(report)
+app.command("doctor")(doctor)
