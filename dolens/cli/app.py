@@ -12,11 +12,11 @@ import typer
 
 from dolens.cli.apply import apply
 from dolens.cli.compare import compare
+from dolens.cli.doctor import doctor
 from dolens.cli.evaluate import evaluate
 from dolens.cli.experiments import experiments
 from dolens.cli.export import export
 from dolens.cli.lens_files import check, convert
-from dolens.cli.doctor import doctor
 from dolens.cli.new import new
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report

@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import typer
-
 # An extra → what needs its packages.
 EXTRAS = {
     "train": "dolens train, evaluate, apply of a run, compare, report",
@@ -239,7 +237,11 @@ def _fonts() -> Finding:
 
 def _completion() -> Finding:
     shell = Path(os.environ.get("SHELL", "")).name
-    files = (".bash_completions/dolens.sh", ".zfunc/_dolens", ".config/fish/completions/dolens.fish")
+    files = (
+        ".bash_completions/dolens.sh",
+        ".zfunc/_dolens",
+        ".config/fish/completions/dolens.fish",
+    )
     try:
         found = [path for path in (Path.home() / name for name in files) if path.exists()]
     except RuntimeError:  # the user has no home folder

@@ -105,7 +105,8 @@ def summary(lens: Lens, where: Conditions) -> str:
     # Of two sections, that of y–z, which files mean.
     y = lens.first_order(where.reference_wavelength, where.object_distance, "y")
     of_section = f" in {first.sections[-1].name}" if first.sections else ""
-    parts.append(f"F/{number(abs(float(y.working_f_number)), 3)}{of_section}")
+    working = "" if where.object_distance is None else "working "
+    parts.append(f"{working}F/{number(abs(float(y.working_f_number)), 3)}{of_section}")
     if where.object_distance is not None:
         parts.append(f"object at {number(where.object_distance)} mm")
     fields = ", ".join(field_label(point, where.field_unit) for point in where.fields)

@@ -154,12 +154,17 @@ def shown_name(lens: Lens) -> str:
 def optics_text(
     system: OpticalSystem, wavelength: float, object_distance: float | None = None
 ) -> str:
-    """Return focal length and working F-number, `f = 50.02 mm, F/4.91 at 587.6 nm`."""
+    """Return focal length and working F-number, `f = 50.02 mm, F/4.91 at 587.6 nm`.
+
+    That of an object at a finite distance is `working F/5.43`: it differs from the one that pages
+    give of an object at infinity.
+    """
     found = first_order(system, wavelength, object_distance)
     efl, f_number = float(found.efl), abs(float(found.working_f_number))
     if not math.isfinite(efl):
         return "afocal"
-    aperture = f", F/{number_text(f_number)}" if math.isfinite(f_number) else ""
+    working = "" if object_distance is None else "working "
+    aperture = f", {working}F/{number_text(f_number)}" if math.isfinite(f_number) else ""
     return with_minus(f"f = {efl:.4g} mm{aperture} at {wavelength:.4g} nm")
 
 

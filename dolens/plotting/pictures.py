@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.plotting.style import PAGE, SMALL, TITLE, draw_title, plain_text, scale_bar
+from dolens.plotting.style import PAGE, SMALL, TITLE, draw_note, draw_title, plain_text, scale_bar
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
 _SMALLEST, _LARGEST = 1.7, 3.2
@@ -33,9 +33,11 @@ def comparison_figure(
     psnr: Mapping[str, Sequence[float]] | None = None,
     title: str | None = None,
     further: Mapping[str, Tensor] | None = None,
+    note: str = "",
 ) -> Figure:
     """Show raw images above restored ones, one column a view. The truth stands at the left where it
-    is the same for all views, else above them.  Labels stand above the columns.
+    is the same for all views, beside the raw images, else above them.  Labels stand above the
+    columns.
 
     Args:
         truth: (3, H, W), or (views, 3, H, W), display-encoded in [0, 1].
@@ -45,6 +47,7 @@ def comparison_figure(
         psnr: {"raw": dB per view, "restored": dB per view} for the titles, or None for none.
         title: above all.
         further: name → pictures (views, 3, H, W), shown below.
+        note: how the pictures are shown and measured, below all.
 
     Returns:
         A figure whose pictures are not interpolated; values are clipped to [0, 1].
@@ -79,7 +82,7 @@ def comparison_figure(
     )
     grid = figure.add_gridspec(len(images), columns)
     if beside:
-        axes = figure.add_subplot(grid[:, 0])
+        axes = figure.add_subplot(grid[0, 0])
         _show(axes, truth)
         axes.set_title("truth", fontsize=SMALL)
     for row, (name, stack) in enumerate(images.items()):
@@ -91,6 +94,8 @@ def comparison_figure(
             above = f"{label}\n" if row == 0 else ""
             axes.set_title(f"{above}{name}{said}", fontsize=SMALL)
     draw_title(figure, title, TITLE - 1)
+    if note:
+        draw_note(figure, note)
     return figure
 
 

@@ -4,6 +4,7 @@ scale bars.
 
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from itertools import cycle, islice
 from typing import Any
@@ -173,6 +174,15 @@ def draw_title(figure: Figure, text: str | None, size: float = TITLE) -> None:
     if text:
         added = _fit(figure.suptitle(text, fontsize=size), _FIGURE_SHARE * figure.bbox.width)
         _grow(figure, added, size)
+
+
+def draw_note(figure: Figure, text: str) -> None:
+    """Write how things are shown below all axes, small; the figure grows by its lines."""
+    # A letter is half as wide as the text is high.
+    letters = int(_FIGURE_SHARE * figure.get_figwidth() * _POINTS_PER_INCH / (0.5 * SMALL))
+    lines = textwrap.wrap(text, letters)
+    figure.supxlabel("\n".join(lines), fontsize=SMALL, color="0.25")
+    _grow(figure, len(lines), SMALL)
 
 
 def draw_axes_title(axes: Axes, text: str | None, size: float = TITLE) -> None:

@@ -68,14 +68,14 @@ def _images(
     quality = {"raw": psnr_db(raw, truth).tolist(), "restored": psnr_db(restored, truth).tolist()}
     kind = {"val": "validation", "test": "test"}[stage]
     title = lens_title(copy.deepcopy(camera.lens).cpu(), camera.views.object_distance)
-    title += f"\none crop of one {kind} photograph, PSNR of this crop"
+    note = f"One crop of one {kind} photograph, with the PSNR of this crop."
     if scores is not None:
         found = scores.metrics["psnr_db"]
         mean, count = float(found.mean()), len(found)
-        title += f"\n(restored, mean over {count} photographs and all views: {mean:.2f} dB)"
-    title += "\ndisplay-encoded (sRGB), clipped to [0, 1], not interpolated"
+        note += f" Restored, {count} photographs and all views have {mean:.2f} dB on average."
+    note += " Pictures are display-encoded (sRGB), clipped to [0, 1] and not interpolated."
     labels = [view_name(label) for label in camera.views.labels()]
-    return comparison_figure(truth, raw, restored, labels, quality, title, depths)
+    return comparison_figure(truth, raw, restored, labels, quality, title, depths, note)
 
 
 def _depths(camera: Camera, taken: Views, functions: Tensor | None) -> dict[str, Tensor]:

@@ -356,8 +356,8 @@ def images_picture(rung: Rung, best_spots: str) -> Figure | None:
         "raw": psnr_db(raw, truth).tolist(),
         "restored": psnr_db(restored, truth).tolist(),
     }
-    title = "One crop of a test photograph, PSNR of this crop; display-encoded (sRGB)"
-    return comparison_figure(truth, raw, restored, labels, quality, title)
+    note = "One crop of a test photograph, with the PSNR of this crop; display-encoded (sRGB)."
+    return comparison_figure(truth, raw, restored, labels, quality, note=note)
 
 
 def _images(label: str, camera: RungOfForm) -> tuple[tuple[Tensor, Tensor, Tensor], list[str]]:

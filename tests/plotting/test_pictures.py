@@ -41,8 +41,8 @@ def test_comparison_shows_each_image_in_its_place():
         np.testing.assert_array_equal(shown[title].get_array(), image.permute(1, 2, 0).numpy())
         assert shown[title].get_interpolation() == "nearest"
     places = {axes.get_title(): axes.get_subplotspec().get_geometry()[2:] for axes in figure.axes}
-    # Cells of two rows of three, by first and last number.
-    assert places["truth"] == (0, 3)
+    # Cells of two rows of three, by first and last number: the truth stands beside the raw images.
+    assert places["truth"] == (0, 0)
     # Labels stand above their columns.
     below = places["8m\nraw: 22.0 dB"], places["restored: 31.0 dB"]
     assert below == ((2, 2), (5, 5)) and places["restored: 30.1 dB"] == (4, 4)

@@ -1,4 +1,5 @@
-import torch
+"""A small network."""
+
 from torch import nn
 
 from dolens.reconstruction.restoration import ResidualRestoration
