@@ -129,12 +129,13 @@ def _trace() -> Finding:
     """Trace a lens as every run does, with the time and the rounding error that it has here."""
     import torch
 
-    import dolens
+    from dolens.optics.rays import Rays
+    from dolens.prescriptions import load_lens
 
     def traced(dtype: torch.dtype) -> tuple[torch.Tensor, float]:
-        lens = dolens.load_lens("cooke_triplet", dtype=dtype)
+        lens = load_lens("cooke_triplet", dtype=dtype)
         place = start.to(dtype)
-        rays = dolens.Rays(place, place.new_tensor([0.0, 0.0, 1.0]), 587.5618)
+        rays = Rays(place, place.new_tensor([0.0, 0.0, 1.0]), 587.5618)
         seconds = []
         for _ in range(4):  # the first may compile
             started = time.perf_counter()
