@@ -59,6 +59,11 @@ ALLOWED = {
         *("errors", "tasks", "html", "files", "optics", "prescriptions"),
         *("analysis", "optimize", "tolerancing", "plotting", "lens_page", "kernels"),
     },
+    # Programs design lenses through all of these.
+    "mcp": {
+        *("errors", "files", "optics", "prescriptions", "analysis", "diffraction", "plotting"),
+        *("views", "lens_page", "lens_search"),
+    },
 }
 # The command line stands above everything, the experiments too.
 ALLOWED["cli"] = {*ALLOWED, "experiments"}

@@ -17,6 +17,7 @@ from dolens.cli.evaluate import evaluate
 from dolens.cli.experiments import experiments
 from dolens.cli.export import export
 from dolens.cli.lens_files import check, convert
+from dolens.cli.mcp import mcp
 from dolens.cli.new import new
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
@@ -77,6 +78,7 @@ def _dolens(
 app.command("show")(show)
 app.command("convert")(convert)
 app.command("check")(check)
+app.command("mcp")(mcp)
 app.command("new")(new)
 app.command("experiments")(experiments)
 app.command("train", cls=PassedOn, add_help_option=False)(train)

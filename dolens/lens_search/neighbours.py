@@ -240,8 +240,11 @@ def _check_kinds(lens: Lens, object_distance: float | None) -> None:
         others = {n for n, p in surface.named_parameters() if bool((p != 0.0).any())}
         if others - {"curvature"} or surface.law is not None or surface.changes_axes:
             raise InputError(f"{name}: surface {number}; allowed: spheres and planes in line")
-    if lens.reversals or any(
-        p.item() != 0.0 for e in lens.elements.values() for p in e.parameters()
+    mirrors = any(medium.name == "mirror" for medium in lens.materials)
+    if (
+        mirrors
+        or lens.reversals
+        or any(p.item() != 0.0 for e in lens.elements.values() for p in e.parameters())
     ):
         raise InputError(f"{name} has mirrors or tilted elements; allowed: refraction in line")
     if lens.index_model != "dfc" or not any(map(is_glass, lens.materials)):

@@ -65,6 +65,7 @@ def test_the_stop_is_moved_without_the_surfaces():
     [
         ("nikon", {}, "surface 17; allowed: spheres and planes"),
         ("la1509", {}, "has a near object"),
+        ("published/maksutov_camera_200", {}, "has mirrors or tilted elements"),
         ("cooke_triplet", {"starts": 0}, "starts: 0; allowed"),
         ("cooke_triplet", {"spread": -1}, "spread: -1; allowed: 0 to below 10"),
         ("cooke_triplet", {"limits": {"trck": 70}}, "did you mean 'track'"),
