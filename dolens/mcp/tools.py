@@ -42,8 +42,8 @@ Limits = dict[str, float | list[float | None] | None]
 Seconds = Annotated[
     float,
     Field(
-        description="s after which no further part of the search begins; it ends up to half a "
-        "minute later",
+        description="s after which no further part of the search begins, at most 0.7 of a call's "
+        "limit; it ends up to half a minute later",
         gt=0,
         le=600,
     ),

@@ -8,7 +8,8 @@ import importlib
 import logging
 import os
 import signal
-from multiprocessing import get_context
+import threading
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -112,6 +113,7 @@ def serve(pipe: Connection, jobs_of: str) -> None:
     """
     # The terminal's Ctrl-C is for the server, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_server, daemon=True).start()
     # Whatever a library prints: the standard output belongs to the protocol.
     os.dup2(2, 1)
     jobs = importlib.import_module(jobs_of).JOBS
@@ -129,3 +131,11 @@ def serve(pipe: Connection, jobs_of: str) -> None:
             logger.exception("%s failed", name)
             answer = ("refused", f"{name}: an error of dolens itself: {type(error).__name__}")
         pipe.send(answer)
+
+
+def _end_with_the_server() -> None:
+    """End this process, whatever it does, when the server's has ended, however that went."""
+    server = parent_process()
+    if server is not None:
+        server.join()
+        os._exit(1)

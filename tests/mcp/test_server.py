@@ -18,6 +18,7 @@ import dolens
 from dolens.errors import one_line
 from dolens.mcp.server import LensServer
 from dolens.mcp.tools import TOOLS, Tools
+from tests.cli.test_app import WITHOUT
 from tests.mcp.test_worker import JOBS
 
 TRIPLET = {"lens": "cooke_triplet"}
@@ -257,6 +258,15 @@ def test_a_server_that_cannot_begin_says_why_in_one_line(tmp_path, arguments, me
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr.startswith(message)
     assert done.stderr.count("\n") == 1 and done.stdout == ""
+
+
+def test_without_its_package_the_command_says_how_to_install_it(tmp_path):
+    command = [sys.executable, "-c", WITHOUT.format(packages=("mcp",)), "mcp", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stderr == (
+        "error: dolens mcp: the package 'mcp' is not installed; install the packages that it needs "
+        "by: pip install 'dolens[mcp]'\n"
+    )
 
 
 def test_the_page_lists_the_tools(root):

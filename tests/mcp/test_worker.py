@@ -1,6 +1,10 @@
 """A job that hangs, fails or dies answers in one line, and the next one runs."""
 
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import anyio
 import pytest
@@ -56,3 +60,33 @@ def test_a_call_that_is_given_up_ends_its_job(worker):
         return await worker.run("sleep", {"seconds": 0})
 
     assert anyio.run(give_up) == "awake"
+
+
+SERVER = """
+import anyio, sys
+from dolens.mcp.worker import Worker
+if __name__ == "__main__":
+    async def run():
+        worker = Worker(60, "tests.mcp.jobs_of_a_test")
+        print(await worker.run("say", {}), flush=True)
+        await worker.run("sleep", {"seconds": 60})
+    anyio.run(run)
+"""
+
+
+def test_the_process_ends_with_the_server_however_that_ends(tmp_path, root):
+    (tmp_path / "server.py").write_text(SERVER)
+    command = [sys.executable, tmp_path / "server.py"]
+    kwargs = {
+        "stdout": -1,
+        "stderr": subprocess.DEVNULL,
+        "env": {**os.environ, "PYTHONPATH": str(root)},
+    }
+    with subprocess.Popen(command, **kwargs) as server:
+        pid = int(server.stdout.readline())
+        assert Path(f"/proc/{pid}").exists()
+        server.kill()
+    deadline = time.monotonic() + 20.0
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
