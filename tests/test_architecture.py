@@ -50,7 +50,7 @@ ALLOWED = {
     },
     # Pages that this machine serves: a lens with sliders, and runs as they go.
     "live": {
-        *("errors", "files", "html", "optics", "prescriptions", "sensor", "analysis"),
+        *("errors", "files", "html", "optics", "prescriptions", "scene", "sensor", "analysis"),
         *("diffraction", "rendering", "optimize", "plotting", "views", "lens_page"),
     },
     "manufacturing": {"errors", "files", "optics", "prescriptions", "tolerancing", "plotting"},

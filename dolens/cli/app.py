@@ -19,6 +19,7 @@ from dolens.cli.export import export
 from dolens.cli.lens_files import check, convert
 from dolens.cli.mcp import mcp
 from dolens.cli.new import new
+from dolens.cli.play import play
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
@@ -76,6 +77,7 @@ def _dolens(
 
 # In the order of `dolens --help`: a lens, an experiment, a run.
 app.command("show")(show)
+app.command("play")(play)
 app.command("convert")(convert)
 app.command("check")(check)
 app.command("mcp")(mcp)

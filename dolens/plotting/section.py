@@ -13,6 +13,7 @@ from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.optics.surfaces import GRAZING
+from dolens.optics.surfaces.clear_aperture import Circle
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
@@ -131,6 +132,8 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
     if isinstance(edge, Polygons):
         found = runs(inside, aperture.semi_diameter)
         return cut.profile(found[0][0], found[-1][1]) if found else _NOTHING
+    if isinstance(edge, Circle) and not (float(cut.az) or float(cut.offset)):
+        return cut.profile(-edge.semi_diameter, edge.semi_diameter)
     # Along the cut, the place nearest to the outline's centre.
     begin = cut.along(*center)
     middle = torch.full((1,), begin, dtype=torch.float64)
@@ -185,7 +188,7 @@ def element_edges(
     faces = _turn(front, -angle), _turn(back, -angle)
 
     def edge(end: int) -> np.ndarray:
-        z, y = _edge(*faces, end).T
+        z, y = ground_edge(*faces, end).T
         return np.stack(_turn((z, y), angle), -1)
 
     return edge(-1), edge(0)
@@ -197,8 +200,9 @@ def _turn(profile: Profile, angle: float) -> Profile:
     return c * z - s * y, s * z + c * y
 
 
-def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
-    """Return the ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
+def ground_edge(front: Profile, back: Profile, end: int) -> np.ndarray:
+    """Return the ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y,
+    along the axis.
 
     A flat from the smaller surface outwards, then a cylinder; a straight line where the flat
     would cut through the other surface.
@@ -257,7 +261,7 @@ def trace_fan(
         n = torch.rsqrt(1.0 + slopes * slopes)
         zero = torch.zeros_like(y)
         ray = Components(zero, y, zero + start, zero, slopes * n, n)
-        return _paths(system, ray, wavelength)
+        return ray_paths(system, ray, wavelength)
 
     if rays == 1:
         aims = torch.zeros_like(pupil.z).reshape(1)
@@ -273,14 +277,18 @@ def trace_fan(
     return path[valid].double().cpu().numpy()
 
 
-def _paths(system: OpticalSystem, ray: Components, wavelength: float) -> tuple[Tensor, Tensor]:
-    """Return the points (N, points, 3) of rays in the lens's axes, and which reach the sensor."""
+def ray_paths(
+    system: OpticalSystem, ray: Components, wavelength: float | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the points (..., points, 3) of rays in the lens's axes, mm: where they begin, on every
+    surface that light meets, on the sensor; and which reach it.
+    """
     traced = trace_surfaces(system, ray, wavelength, record=True)
     landed = trace_to_sensor(system, traced, wavelength)
     end = landed.ray._replace(z=landed.ray.z - system.vertices[-1])
     met = [traced.points[number - 1] for number in system.met]
     points = [ray[:3], *met, to_lens_axes(end, system.all_axes[-1])[:3]]
-    return torch.stack([torch.stack(point, -1) for point in points], 1), landed.valid
+    return torch.stack([torch.stack(point, -1) for point in points], -2), landed.valid
 
 
 def _aimed_fan(
@@ -312,7 +320,7 @@ def _aimed_fan(
             ray = transfer(ray, -lead.clamp(0.0, longest))
         else:
             ray = transfer(ray, (start - ray.z) / ray.n)
-        points, valid = _paths(system, ray, wavelength)
+        points, valid = ray_paths(system, ray, wavelength)
         return points, valid & aimed.converged
 
     if rays == 1:
