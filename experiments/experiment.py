@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import lightning
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dolens.errors import InputError, check_count
@@ -86,6 +87,12 @@ class Experiment(lightning.LightningModule):
 
     def training_figures(self) -> Figures:
         """Return the figures that are logged every few epochs, after validation."""
+        return {}
+
+    def lens_values(self) -> Mapping[str, Tensor]:
+        """Return the parameters of the lens that move, by name, as the last step left them; they
+        are recorded for `dolens watch`.
+        """
         return {}
 
     def check_trainer(self, trainer: lightning.Trainer) -> None:

@@ -1,4 +1,4 @@
-"""Fixtures: a page in headless Chromium, for the conftest.py of those who look at pages."""
+"""Fixtures of all tests that look at pages in headless Chromium, which is started once."""
 
 import shutil
 
@@ -29,4 +29,4 @@ def page(chromium):
             "console", lambda said: problems.append(said.text) if said.type == "error" else None
         )
         yield opened
-    assert problems == []
+    assert problems == [], problems

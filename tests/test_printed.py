@@ -223,7 +223,7 @@ def test_a_command_about_a_lens_runs(words, in_it, here, monkeypatch):
     assert done.exit_code == 0, (done.output, done.exception)
 
 
-@those("apply", "evaluate", "compare", "report", "mcp")
+@those("apply", "evaluate", "compare", "report", "mcp", "watch")
 def test_a_command_about_a_run_takes_the_arguments(words, in_it, here):
     """It runs in tests/test_tutorials.py, tests/experiments and tests/mcp; that of a lens here."""
     if kind_of(words) == "apply" and "lens.zmx" in words:

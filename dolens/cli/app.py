@@ -24,6 +24,7 @@ from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
 from dolens.cli.train import PassedOn, train
+from dolens.cli.watch import watch
 from dolens.errors import InputError, one_line
 from dolens.files import installed_version
 from dolens.threads import limit_threads
@@ -84,6 +85,7 @@ app.command("mcp")(mcp)
 app.command("new")(new)
 app.command("experiments")(experiments)
 app.command("train", cls=PassedOn, add_help_option=False)(train)
+app.command("watch")(watch)
 app.command("evaluate")(evaluate)
 app.command("apply")(apply)
 app.command("compare")(compare)

@@ -33,7 +33,7 @@ _GAP, _TEXT = 4, 15  # pixels between pictures, and of the line of text above th
 _WIDEST = 256
 
 
-class _ChosenCrops(lightning.Callback):
+class ChosenCrops(lightning.Callback):
     """Looks at the first crops of some photographs, spread over all of a stage."""
 
     def __init__(self, photographs: int) -> None:
@@ -50,7 +50,7 @@ class _ChosenCrops(lightning.Callback):
         chosen = [found[(2 * n + 1) * len(found) // (2 * count)] for n in range(count)]
         self._crops = {first[name]: name for name in chosen}
 
-    def _seen(
+    def seen(
         self, trainer: lightning.Trainer, camera: Camera, stage: str, batch: Tensor, index: int
     ) -> Iterator[tuple[int, str, str, tuple[Tensor, Tensor, Tensor]]]:
         """Yield number, photograph, view and images of the chosen crops in a batch.
@@ -71,7 +71,7 @@ class _ChosenCrops(lightning.Callback):
                 yield first + crop, shown_name(photograph), label, (truth, raw, found)
 
 
-class ValidationPictures(_ChosenCrops):
+class ValidationPictures(ChosenCrops):
     """Logs truth, sensor's image and restored image side by side, with their PSNR.
 
     The pictures are called `<photograph>/<view>`, as `chelsea/8m`; each shows the same crop
@@ -128,7 +128,7 @@ class ValidationPictures(_ChosenCrops):
         """Make the pictures of the chosen crops in this batch."""
         if not isinstance(pl_module, Camera):
             return
-        for crop, photograph, view, images in self._seen(
+        for crop, photograph, view, images in self.seen(
             trainer, pl_module, "val", batch, batch_idx
         ):
             self._found.append(_picture(crop, f"{photograph}/{view}", *images))
@@ -198,7 +198,7 @@ def _middle(image: Tensor) -> np.ndarray:
     return (cut.permute(1, 2, 0) * 255.0).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-class PhotographsPage(_ChosenCrops):
+class PhotographsPage(ChosenCrops):
     """Writes `photographs.html`: truth, sensor's image and restored image of some test photographs,
     with a slider between any two of them, a magnifier and their scores.
 
@@ -240,7 +240,7 @@ class PhotographsPage(_ChosenCrops):
         """Keep the images of the chosen crops in this batch."""
         if not isinstance(pl_module, Camera):
             return
-        for crop, photograph, view, (truth, raw, restored) in self._seen(
+        for crop, photograph, view, (truth, raw, restored) in self.seen(
             trainer, pl_module, "test", batch, batch_idx
         ):
             scores = scores_of(raw, truth, "raw_") | scores_of(restored, truth)

@@ -304,6 +304,10 @@ class CameraModule(Camera):
         self.log("cost/rays", float(self.views.rays()))
         self.log_dict(variable_numbers(self.variables()))
 
+    def lens_values(self) -> dict[str, Tensor]:
+        """Return the variables, and what follows from them."""
+        return self.variables()
+
     # ---------------------------------------------------------------- evaluation
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:

@@ -340,6 +340,13 @@ class DesignModule(Experiment):
 
     # ---------------------------------------------------------------- what is logged
 
+    def lens_values(self) -> dict[str, Tensor]:
+        """Return the variables, what follows from them, and the focus."""
+        if self.merit is None:
+            return {}
+        foci = {name: torch.tensor(at) for name, at in self.merit().foci().items()}
+        return {**self.variables(), **foci}
+
     @property
     def rays(self) -> int:
         """Return the number of rays of one evaluation of the merit."""

@@ -7,12 +7,34 @@ from matplotlib.figure import Figure
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.tables import Row
+from dolens.experiments.watch.history import Frame
 from dolens.lens_search.finds import Finds, course_picture, starts_and_designs, starts_picture
 from dolens.lens_search.form_report import FormReport, report_form
 from dolens.lens_search.page import Pictures, write_page
 from dolens.lens_search.search_report import sections_figure
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.verification import Requirements
+from dolens.prescriptions import prescription_of
+
+RECORDED_FORMS = 6
+"""Forms that a frame of the history has."""
+
+
+def forms_frame(finds: Finds) -> Frame:
+    """Return the best forms of a search as a frame of its run's history; see `Finds.rank`."""
+    return Frame(
+        0,
+        0.0,
+        forms=[
+            {
+                "merit": found.merit,
+                "spots": list(found.rms_spot_um),
+                "way": ", ".join(found.history),
+                "lens": prescription_of(found.lens),
+            }
+            for found in finds.found[:RECORDED_FORMS]
+        ],
+    )
 
 
 def form_rows(reports: Sequence[FormReport]) -> Iterator[Row]:

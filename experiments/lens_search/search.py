@@ -16,13 +16,16 @@ from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError, check_count
 from dolens.experiments.experiment import Analysis, Figures
 from dolens.experiments.lens_search.found_forms import (
+    RECORDED_FORMS,
     check_rows,
     form_reports,
     form_rows,
+    forms_frame,
     search_figures,
     write_forms_page,
 )
 from dolens.experiments.tables import Row
+from dolens.experiments.watch.history import Recorder
 from dolens.experiments.workers import workers_of
 from dolens.files import written_whole
 from dolens.lens_search.arrangement import Arrangement
@@ -95,11 +98,20 @@ class LensSearchModule(Analysis):
         started = time.perf_counter()
         assert self.folder is not None  # a run has one
         kept = KeptSteps(self.folder / "search", self.specification, self.plan)
+        recorder = Recorder(self.folder)
+        recorded = recorder.go_on(self.folder)
         with named_stage("search"), self.workers.open() as map_tasks:
-            for step in search(self.specification, self.plan, kept.map(map_tasks)):
+            steps = search(self.specification, self.plan, kept.map(map_tasks))
+            for number, step in enumerate(steps, 1):
                 self.finds.add(step, kept.seconds_before + time.perf_counter() - started)
                 logger.info("%s", self.finds.report())
+                if number > recorded and recorder.due():
+                    asked = time.monotonic()
+                    self.finds.rank(RECORDED_FORMS)
+                    recorder.add(number, forms_frame(self.finds), asked)
         self.finds.rank(self.forms)
+        recorder.add(max(number, recorded), forms_frame(self.finds), time.monotonic())
+        recorder.write()
         if not self.finds.found:
             logger.warning("No start became a lens that keeps the specification.")
             return self._numbers()

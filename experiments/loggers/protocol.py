@@ -77,19 +77,20 @@ class TakesSummary(Protocol):
         """Keep what runs are compared by; called once, when the run is finished."""
 
 
-def require_package(package: str, extra: str) -> None:
+def require_package(package: str, extra: str, setting: str | None = None) -> None:
     """Check that an optional package is there.
 
     Args:
         package: name for import.
         extra: of this package, that installs it.
+        setting: that asks for it; None: the logger of the extra's name.
 
     Raises:
         InputError: it is not installed.
     """
     if find_spec(package) is None:
         raise InputError(
-            f"logger={extra}: the package '{package}' is not installed; "
+            f"{setting or f'logger={extra}'}: the package '{package}' is not installed; "
             f"pip install 'dolens[{extra}]'"
         )
 

@@ -106,7 +106,7 @@ _PRECISIONS = ("highest", "high", "medium")
 # Whose types are compared with the hints; others have checks of their own.
 _TYPED = (
     *("module", "data", "trainer", "callbacks", "logger", "lens"),
-    *("train", "test", "seed", "ckpt_path", "state"),
+    *("train", "test", "seed", "ckpt_path", "state", "live"),
 )
 
 
@@ -135,6 +135,7 @@ class RunSettings:
         ckpt_path: a checkpoint to resume from, or None.
         objective: the name of the metric that the run returns, or a list of them.
         state: of a lens that zooms or focuses, the state to work with; None: the lens itself.
+        live: whether a page shows the run; see `dolens watch`.
 
     Raises:
         InputError: a value that is not allowed.
@@ -156,8 +157,9 @@ class RunSettings:
     ckpt_path: str | None
     objective: str | ListConfig
     lens: DictConfig | None = None
-    # Run folders of old lack it.
+    # Run folders of old lack them.
     state: str | None = None
+    live: bool = False
 
     def __post_init__(self) -> None:
         hints = parameters_of(type(self)).hints

@@ -27,7 +27,13 @@ from dolens.experiments.callbacks.interruption import (
     StarvationWarning,
 )
 from dolens.experiments.experiment import Experiment, check_experiment
-from dolens.experiments.loggers.protocol import RunSummary, all_settings, choices_of, summarise
+from dolens.experiments.loggers.protocol import (
+    RunSummary,
+    all_settings,
+    choices_of,
+    require_package,
+    summarise,
+)
 from dolens.experiments.loggers.trackers import History
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
@@ -50,6 +56,7 @@ from dolens.experiments.running.trainer import all_processes, made_trainer
 from dolens.experiments.running.user_configuration import import_extensions
 from dolens.experiments.search.pruning import TrialPruned, trial_callbacks
 from dolens.experiments.settings import check_sensor_distance, register_resolvers
+from dolens.experiments.watch.started import start_page
 from dolens.files import written_whole
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
@@ -99,12 +106,14 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     epochs = ResumedEpochs()
     callbacks += [epochs, ResumedSchedules(), LogsBeforeCheckpoints()]
     callbacks.append(SettingsInCheckpoints(written))
+    if settings.live:
+        require_package("starlette", "live", "live: true")
     starvation = StarvationWarning()
     callbacks += [starvation, LoggedObjectives(settings.objectives), *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer = made_trainer(settings.trainer, callbacks, loggers)
-    refuse_processes_in_sweep(trainer)
+    refuse_in_sweep(trainer, settings.live)
     module.check_trainer(trainer)
     if not settings.trainer.get("plugins"):  # which may bring a writer of their own
         trainer.strategy.checkpoint_io = WholeCheckpoints()
@@ -116,6 +125,8 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     device = str(trainer.strategy.root_device)
     info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
     write_json(folder / INFO, {**info, "status": "running"})
+    if settings.live and trainer.is_global_zero:
+        start_page(folder)
     status = "failed"
     try:
         with all_processes(trainer, settings.threads):
@@ -244,17 +255,20 @@ def summary_of(module: Experiment) -> dict[str, float]:
         return {}
 
 
-def refuse_processes_in_sweep(trainer: lightning.Trainer) -> None:
-    """Processes that one run starts would each train another sample of a sweep; refuse.
+def refuse_in_sweep(trainer: lightning.Trainer, live: bool) -> None:
+    """Refuse what a job of a sweep cannot have: processes of its own, each of which would train
+    another sample of the sweep, and a page.
 
     Raises:
-        InputError: there are several.
+        InputError: there are several processes, or a page.
     """
     multirun = HydraConfig.get().mode is not None and HydraConfig.get().mode.name == "MULTIRUN"
     if multirun and trainer.world_size > 1:
         raise InputError(
             f"trainer.devices: {trainer.world_size} processes cannot be swept with -m; allowed: 1"
         )
+    if multirun and live:
+        raise InputError("live: true cannot be swept with -m; dolens watch RUN shows one run")
 
 
 def resume_command() -> str:
