@@ -22,18 +22,19 @@ BLOCKS = [
     for block in printed.BLOCKS
     if block.page == "docs/extending.md" and not block.text.startswith("python -m pytest")
 ]
-FILES = {block.title: block.text for block in BLOCKS if block.title}
+FILES = {block.title.removeprefix("mine/"): block.text for block in BLOCKS if block.title}
 COMMANDS = [block for block in BLOCKS if block.language == "sh"]
 SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block.title]
 # A command, and the experiment that it runs.
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-# Runs lists of command lines as `python` runs them, and leaves how they ended: each list in one
+# Runs lists of command lines, those of `dolens` and scripts, and leaves how they ended: each list in one
 # process, a copy of one that has imported PyTorch and Lightning, which takes longer than most.
 IN_TWO_PROCESSES = """
 import json, os, runpy, sys, traceback
 import dolens.experiments.running.main
+from dolens.cli.app import main
 for number, commands in enumerate(json.loads(sys.argv[1])):
     sys.stdout.flush()
     if os.fork():
@@ -42,7 +43,10 @@ for number, commands in enumerate(json.loads(sys.argv[1])):
     ends = []
     for sys.argv in commands:
         try:
-            runpy.run_path(sys.argv[0], run_name="__main__")
+            if sys.argv[0] == "dolens":
+                main()
+            else:
+                runpy.run_path(sys.argv[0], run_name="__main__")
             ends.append(None)
         except SystemExit as end:
             ends.append(end.code)
@@ -55,11 +59,9 @@ for number, commands in enumerate(json.loads(sys.argv[1])):
 
 
 @pytest.fixture(scope="module")
-def checkout(tmp_path_factory):
-    """A folder with the repository's files and those of the document."""
-    folder = tmp_path_factory.mktemp("checkout")
-    for name in ("train.py", "conf", "dolens", "experiments"):
-        (folder / name).symlink_to(ROOT / name)
+def mine(tmp_path_factory):
+    """The folder `mine` of the document, with its files and nothing else."""
+    folder = tmp_path_factory.mktemp("mine")
     for path, text in FILES.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text, encoding="utf-8")
@@ -67,30 +69,30 @@ def checkout(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def ended(checkout):
+def ended(mine):
     """How all scripts ended, and all commands, and what they said on their way.
 
     What is registered in one serves no other: each is of a section, whose files it alone uses.
     """
     scripts = [f"script{number}.py" for number in range(len(SCRIPTS))]
     for name, block in zip(scripts, SCRIPTS, strict=True):
-        (checkout / name).write_text(block.text, encoding="utf-8")
+        (mine / name).write_text(block.text, encoding="utf-8")
     commands = []
     for block in COMMANDS:
-        paths, python, *arguments = shlex.split(block.text)
-        assert (paths, python, arguments[0]) == ("PYTHONPATH=mine", "python", "train.py")
-        commands.append(arguments)
+        words = shlex.split(block.text)
+        assert words[:2] == ["dolens", "train"]
+        commands.append(words)
     lists = [[[name] for name in scripts], commands]
     done = subprocess.run(
         [sys.executable, "-c", IN_TWO_PROCESSES, json.dumps(lists)],
-        cwd=checkout,
-        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
+        cwd=mine,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
     )
     said = done.stdout[-2000:] + done.stderr[-4000:]
     assert done.returncode == 0, said
-    return *(json.loads((checkout / f"ends{n}.json").read_text()) for n in (0, 1)), said
+    return *(json.loads((mine / f"ends{n}.json").read_text()) for n in (0, 1)), said
 
 
 def a_camera_of_nearer_objects_with_its_network_and_loss(folder, metrics):
@@ -142,10 +144,10 @@ PROMISES = {
 @pytest.mark.parametrize(
     ("block", "experiment"), TRAININGS, ids=[block.section for block in COMMANDS]
 )
-def test_a_command_leaves_what_the_text_promises(checkout, ended, block, experiment):
+def test_a_command_leaves_what_the_text_promises(mine, ended, block, experiment):
     _, commands, said = ended
     assert not commands[COMMANDS.index(block)], said
-    (folder,) = (checkout / "outputs" / experiment).iterdir()
+    (folder,) = (mine / "outputs" / experiment).iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     PROMISES[block.section, experiment](folder, metrics)
 
@@ -176,4 +178,4 @@ def test_the_table_names_the_files_of_the_document_and_counts_them():
     assert len(named) >= 7
     for paths, count in named:
         assert len(paths) == count
-        assert set(paths) <= set(FILES)
+        assert {path.removeprefix("mine/") for path in paths} <= set(FILES)
