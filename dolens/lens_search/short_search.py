@@ -174,11 +174,12 @@ class LensSearch:
 def search(
     efl: float,
     f_number: float,
-    field: float,
+    field: float | Sequence[float],
     elements: int | Sequence[int],
     glasses: Sequence[str] = (),
     wavelengths: Sequence[float] = _VISIBLE,
     limits: Mapping[str, Any] | None = None,
+    aspheres: int = 0,
     starts: int = 500,
     seconds: float | None = None,
     forms: int = 10,
@@ -194,7 +195,8 @@ def search(
     Args:
         efl: focal length, mm.
         f_number: focal length over the diameter of the entrance pupil.
-        field: degrees from the axis to the edge; the axis and 0.7 of it count too.
+        field: degrees from the axis to the edge, where the axis and 0.7 of it count too; or all
+            angles that count, the first 0, as aspheres at a wide field need.
         elements: how many, all in air; or elements of each cemented group from the front, as
             (1, 2, 2, 1).
         glasses: one for all elements or one for each, as a prescription names them
@@ -203,6 +205,7 @@ def search(
         limits: of `dolens.lens_search.specification.Limits`, mm, as `{"track": 70, "back_focus":
             20}`.  Where they are not given: glass 0.02 to 0.2 of the focal length thick, 0.01 at
             the edge, air 0.002 to 0.4, back focus 0.2 at least, track 2 at most, distortion 2 %.
+        aspheres: coefficients from r⁴ on of both surfaces of every element; 0: spheres.
         starts: random starts, over all places of the stop.
         seconds: after so many no further task begins, and what was found is checked; those that
             have begun, and the compilation of a first call, take up to half a minute more.  None:
@@ -222,7 +225,9 @@ def search(
         50.0
     """
     started = time.perf_counter()
-    asked = specification(efl, f_number, field, elements, glasses, wavelengths, limits or {})
+    asked = specification(
+        efl, f_number, field, elements, glasses, wavelengths, limits or {}, aspheres
+    )
     known = sorted(set(SearchPlan.__dataclass_fields__) - {"starts", "seed"})
     check_keys(plan, known, "search()")
     check_amounts(starts, forms, seed, seconds)
@@ -284,22 +289,28 @@ def collected(
 def specification(
     efl: float,
     f_number: float,
-    field: float,
+    field: float | Sequence[float],
     elements: int | Sequence[int],
     glasses: Sequence[str],
     wavelengths: Sequence[float],
     limits: Mapping[str, Any],
+    aspheres: int = 0,
 ) -> Specification:
     """Return the specification of a search; see `search` for the arguments.
 
     Raises:
         InputError: a number out of range, or an unknown limit.
     """
-    for name, value in (("efl", efl), ("f_number", f_number), ("field", field)):
+    several = isinstance(field, list | tuple)
+    angles = tuple(field) if isinstance(field, list | tuple) else (field,)
+    fields = (("field", angle) for angle in angles)
+    for name, value in (("efl", efl), ("f_number", f_number), *fields):
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise InputError(f"{name}: {value!r}; allowed: a number")
-    if not 0.0 <= field < 80.0:
-        raise InputError(f"field: {field:g}; allowed: 0 to below 80 degrees from the axis")
+    for angle in angles:
+        if not 0.0 <= angle < 80.0:
+            raise InputError(f"field: {angle:g}; allowed: 0 to below 80 degrees from the axis")
+    check_count("aspheres", aspheres, 0)
     if not efl > 0.0:
         raise InputError(f"efl: {efl:g}; allowed: a positive focal length in mm")
     if isinstance(elements, int) and not isinstance(elements, bool) and elements > 0:
@@ -324,11 +335,12 @@ def specification(
     return Specification(
         focal_length=float(efl),
         f_number=float(f_number),
-        fields=(0.0, _ZONE * field, float(field)) if field else (0.0,),
+        fields=angles if several or not angles[0] else (0.0, _ZONE * angles[0], angles[0]),
         wavelengths=tuple(wavelengths),
         groups=groups,
         glasses=tuple(named),
         limits=Limits(**{**lengths, **limits}),
+        asphere_terms=(aspheres,),
         glass_choice=None if named else GlassChoice(**_CHOSEN),
     )
 
