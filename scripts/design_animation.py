@@ -49,7 +49,9 @@ def designs() -> Iterator[tuple[int, dolens.Lens]]:
 
 
 @torch.no_grad()
-def frame(iteration: int, lens: dolens.Lens, spots: SpotDiagram, course: list[float]) -> Image.Image:
+def frame(
+    iteration: int, lens: dolens.Lens, spots: SpotDiagram, course: list[float]
+) -> Image.Image:
     """Draw a frame: the section above, spots and course below."""
     figure = Figure(figsize=(9.0, 4.5), dpi=100)
     section = figure.add_axes((0.01, 0.36, 0.98, 0.62))

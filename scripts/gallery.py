@@ -59,7 +59,10 @@ def take(run: Path, figure: str | None) -> str:
     names = [entry.partition("=")[2] for entry in given if entry.startswith("experiment=")]
     changed = [entry for entry in given if not entry.startswith("experiment=")]
     found = [run / f"figures/{name}.png" for name in ((figure,) if figure else FIGURES)]
-    with Image.open(next(path for path in found if path.is_file())) as picture:
+    taken = next((path for path in found if path.is_file()), None)
+    if taken is None:
+        sys.exit(f"error: {run} has none of {', '.join(str(path) for path in found)}")
+    with Image.open(taken) as picture:
         PICTURES.mkdir(parents=True, exist_ok=True)
         (PICTURES / f"{names[0]}.webp").write_bytes(card_picture(picture))
     settings = yaml.safe_load(SETTINGS.read_text("utf-8")) if SETTINGS.is_file() else {}
@@ -97,19 +100,19 @@ def experiment_card(name: str, page: str | None) -> str:
     return card(image, title, known[name].summary, f"dolens train experiment={name}", notes)
 
 
-def cells_of(name: str) -> list[dict[str, Any]]:
-    """Return the cells of a notebook, by its name `notebooks/…`."""
-    return json.loads((ROOT / f"docs/{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+def read_notebook(name: str) -> dict[str, Any]:
+    """Return a notebook by its name `notebooks/…`."""
+    return json.loads((ROOT / f"docs/{name}.ipynb").read_text(encoding="utf-8"))
 
 
 def notebook_card(name: str) -> str:
     """Return the card of a notebook, as Markdown."""
-    notebook = json.loads((ROOT / f"docs/{name}.ipynb").read_text(encoding="utf-8"))
+    notebook = read_notebook(name)
     title, text = "".join(notebook["cells"][0]["source"]).split("\n\n")[:2]
     sentence = re.split(r"(?<=[.!?])\s", text.replace("\n", " "))[0]
     image = f"![](images/{name}.webp){{ loading=lazy }}"
     title = f"[{title.removeprefix('# ')}]({name}.ipynb)"
-    notes = [notebook["metadata"].get("dolens", {}).get("cost", "seconds")]
+    notes = [notebook["metadata"]["dolens"]["cost"]]
     return card(image, title, sentence, f"jupyter lab docs/{name}.ipynb", notes)
 
 
@@ -121,10 +124,10 @@ def card(image: str, title: str, sentence: str, command: str, notes: list[str]) 
 
 def cards(found: re.Match[str]) -> str:
     """Return the cards that a line of a page asks for, as Markdown."""
-    made = [
-        notebook_card(name) if name.startswith("notebooks/") else experiment_card(name, found["page"])
-        for name in found["names"].split()
-    ]
+    made = []
+    for name in found["names"].split():
+        is_notebook = name.startswith("notebooks/")
+        made.append(notebook_card(name) if is_notebook else experiment_card(name, found["page"]))
     return "\n".join(['<div class="cards" markdown>\n', *made, "\n</div>"])
 
 
@@ -140,7 +143,7 @@ def on_files(files: Any, config: Any) -> Any:
     for path in sorted((ROOT / "docs/notebooks").glob("*.ipynb")):
         shown = [
             data
-            for cell in cells_of(f"notebooks/{path.stem}")
+            for cell in read_notebook(f"notebooks/{path.stem}")["cells"]
             for output in cell.get("outputs", [])
             for kind, data in output.get("data", {}).items()
             if kind in ("image/png", "image/jpeg")

@@ -29,8 +29,8 @@ SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-# Runs lists of command lines, those of `dolens` and scripts, and leaves how they ended: each list in one
-# process, a copy of one that has imported PyTorch and Lightning, which takes longer than most.
+# Runs lists of command lines, those of `dolens` and scripts, and leaves how they ended: each list
+# in one process, a copy of one that has imported PyTorch and Lightning, which takes longer.
 IN_TWO_PROCESSES = """
 import json, os, runpy, sys, traceback
 import dolens.experiments.running.main

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from dolens.experiments.running.catalogue import configuration_folders, experiments
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -70,3 +72,22 @@ def test_what_a_function_returns_is_one_entry(site):
     text = (site / "api/optics.html").read_text(encoding="utf-8")
     for part in re.findall(r"Returns:.*?</ul>", text, re.S):
         assert part.count("<li") == 1, re.sub(r"<[^>]*>", "", part)[:300]
+
+
+def test_the_gallery_has_every_experiment_and_notebook_once_with_its_cost(site):
+    text = (site / "gallery.html").read_text(encoding="utf-8")
+    known = experiments(configuration_folders(ROOT))
+    assert len(known) > 40
+    for one in known:
+        assert text.count(f"<code>dolens train experiment={one.name}</code>") == 1
+        assert one.cost and one.cost in text
+    for path in (ROOT / "docs/notebooks").glob("*.ipynb"):
+        assert text.count(f"<code>jupyter lab docs/notebooks/{path.name}</code>") == 1
+        assert (site / f"images/notebooks/{path.stem}.webp").is_file()
+
+
+def test_pictures_load_quickly():
+    """In all as much as a photograph or two of a telephone."""
+    sizes = [path.stat().st_size for path in (ROOT / "docs/images").rglob("*.*")]
+    assert sum(sizes) < 4_000_000
+    assert max(p.stat().st_size for p in (ROOT / "docs/images/gallery").iterdir()) <= 40_000

@@ -7,6 +7,7 @@ import dolens
 from dolens import InputError
 from dolens.lens_search.finds import Finds
 from dolens.lens_search.search import SearchPlan, search
+from dolens.lens_search.short_search import specification
 from dolens.lens_search.specification import Limits, Specification
 from dolens.tasks import in_turn
 
@@ -99,3 +100,13 @@ def test_what_cannot_be_searched_is_refused_in_one_line(given, message):
     usual = {"efl": 50, "f_number": 4.9, "field": 20, "elements": 3, "glasses": GLASSES}
     with pytest.raises(InputError, match=message):
         dolens.search(**{**usual, **given})
+
+
+def test_all_fields_that_count_are_given_at_once_and_every_surface_has_an_asphere():
+    angles = (0, 12, 20, 26)
+    asked = specification(4.0, 2.8, angles, 3, ["1.53/55"], (587.6,), {}, aspheres=2)
+    assert (asked.fields, asked.asphere_terms) == (angles, (2,))
+    with pytest.raises(InputError, match="fields must begin with 0 degrees"):
+        specification(4.0, 2.8, (12, 20), 3, ["1.53/55"], (587.6,), {})
+    with pytest.raises(InputError, match="aspheres: -1; allowed: an integer of 0 or more"):
+        specification(4.0, 2.8, 20, 3, ["1.53/55"], (587.6,), {}, aspheres=-1)
