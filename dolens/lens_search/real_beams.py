@@ -20,6 +20,8 @@ from dolens.optics.surfaces.clear_aperture import Unlimited
 
 # Field heights from the axis to the edge, and rays through the stop, besides those on its rim.
 FIELDS, RAYS = 21, 400
+# Degrees, or mm of a near object: the edge of the field of a lens for the axis alone.
+_AXIS = 1e-4
 # Radii at which the distance between two surfaces is taken.
 RADII = 65
 # What a drawn surface reaches beyond the rays.
@@ -80,19 +82,22 @@ class RealBeams:
 def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     """Trace beams through the physical stop, of fields from the axis to the edge of the lens's.
 
+    Those of a lens for the axis alone stay at the axis, but for a rounding error.
+
     Args:
         lens: centred, in double precision, with fields.
         count: fields.
         rays: of each field and wavelength, a multiple of four.
 
     Raises:
-        InputError: the lens is not centred, or has no field but the axis.
+        InputError: the lens is not centred.
     """
     system = lens.system()
     if system.breaks or system.mirrors or not system.rotationally_symmetric:
         raise InputError(f"lens '{lens.name}': found lenses are checked that are centred, of glass")
     where = conditions(lens)
-    (scan,) = field_scans(lens, where.object_distance, count=count)
+    edge = None if bool(where.fields.any()) else _AXIS
+    (scan,) = field_scans(lens, where.object_distance, edge, count)
     pupil, weight = uniform_pupil_points(rays)
     # The chief ray weighs nothing, and crosses where surfaces cross on the axis.
     pupil = torch.cat([pupil.new_zeros(1, 2), pupil])

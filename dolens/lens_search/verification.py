@@ -70,7 +70,9 @@ class Requirements:
     def of(cls, specification: Specification) -> "Requirements":
         """Return what the specification of a search asks of its lenses."""
         limits = specification.limits
-        distortion = None if limits.distortion is None else 100.0 * limits.distortion
+        distortion = None
+        if limits.distortion is not None and any(specification.fields):
+            distortion = 100.0 * limits.distortion
         return cls(
             focal_length=specification.focal_length,
             f_number=specification.f_number,
@@ -185,7 +187,7 @@ def verify(
         rays: of each field and wavelength, a multiple of four.
 
     Raises:
-        InputError: the lens is not centred, or has no field but the axis.
+        InputError: the lens is not centred.
     """
     where = conditions(lens)
     beams = real_beams(lens, fields, rays)

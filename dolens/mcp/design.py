@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.analysis.conditions import conditions
 from dolens.errors import InputError
 from dolens.lens_page.lens_tolerances import LensTolerances
 from dolens.lens_page.overview import prepared_lens
@@ -161,13 +160,10 @@ def check(prescription: Prescription, picture: bool, **required: Any) -> Answer:
     lens: Any = prepared_lens(lens_of(prescription))
     mean, error = mean_spot(lens)
     most = limits.pop("mean_rms_spot_um", None)
-    if len(conditions(lens).fields) == 1 and not bool(conditions(lens).fields.any()):
-        checks = _on_axis(lens, limits)
-    else:
-        checks = [
-            (c.name, c.value, c.unit, c.least, c.most, c.holds, c.place)
-            for c in verify(lens, Requirements(**limits)).checks
-        ]
+    checks = [
+        (c.name, c.value, c.unit, c.least, c.most, c.holds, c.place)
+        for c in verify(lens, Requirements(**limits)).checks
+    ]
     holds = None if most is None else mean <= most
     checks.append(("mean RMS spot", mean, "µm", None, most, holds, "the lens's own fields"))
     keys = ("quantity", "value", "unit", "least", "most", "holds", "place")
@@ -185,29 +181,6 @@ def check(prescription: Prescription, picture: bool, **required: Any) -> Answer:
     answer.errs("limits", 1e-3, "", "a limit may be missed by this share, or by so many mm or °")
     answer.show(lens.draw() if picture else None, picture)
     return answer
-
-
-def _on_axis(lens: Any, limits: Mapping[str, Any]) -> list[tuple[Any, ...]]:
-    """Return the checks of a lens whose one field is the axis, by paraxial rays."""
-    found = lens.summary()
-    rows: list[tuple[Any, ...]] = []
-    for key, name, value, unit in (
-        ("focal_length", "focal length", found.efl, "mm"),
-        ("f_number", "F-number", abs(found.working_f_number), ""),
-    ):
-        target, share = limits.get(key), limits.get(f"{key}_error", 0.02)
-        least, most = (
-            (None, None) if target is None else (target * (1 - share), target * (1 + share))
-        )
-        holds = None if target is None else bool(least <= value <= most)
-        rows.append((name, value, unit, least, most, holds, "paraxial"))
-    track, focus = found.total_track, float(lens.sensor_distance)
-    most, least = limits.get("total_track"), limits.get("back_focus")
-    holds = None if most is None else track <= most * (1.0 + 1e-3)
-    rows.append(("total track", track, "mm", None, most, holds, ""))
-    holds = None if least is None else focus >= least * (1.0 - 1e-3)
-    rows.append(("back focus", focus, "mm", least, None, holds, ""))
-    return rows
 
 
 def tolerance(

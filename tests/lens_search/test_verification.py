@@ -9,6 +9,7 @@ import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.lens_page.overview import prepared_lens
 from dolens.lens_search.real_beams import real_beams, spaces, with_drawn_heights
 from dolens.lens_search.specification import Limits, Specification
 from dolens.lens_search.verification import Check, Requirements, verify
@@ -191,3 +192,14 @@ def test_requirements_follow_from_the_specification_of_a_search():
     assert (required.focal_length, required.f_number, required.total_track) == (100.0, 3.0, 250.0)
     assert required.distortion == 1.0 and required.glass_centre == (2.0, 120.0)
     assert required.vignetting == 0.3
+
+
+def test_a_lens_for_the_axis_alone_is_checked_there(triplet):
+    """Its beam is narrower than those of its full field, and clipped by nothing."""
+    alone = prepared_lens(triplet, [(0.0, 0.0)])
+    found = verify(alone, Requirements(50.0, f_number=4.9, total_track=61.0), FIELDS, RAYS)
+    assert found.holds and found.value("vignetting") == 0.0
+    assert abs(found.value("chief-ray angle")) < 0.001
+    pupil = 0.5 * alone.first_order().entrance_pupil.diameter.item()
+    assert found.beams.heights[0].item() == pytest.approx(pupil, rel=0.02)
+    assert pupil < 0.6 * alone.surfaces["1"].semi_diameter
