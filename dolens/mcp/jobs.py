@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.files import packaged_configuration
 from dolens.mcp.analyses import analyse, show, trace
 from dolens.mcp.answer import Answer, Prescription, plain
 from dolens.mcp.design import check, neighbours, optimize, search, tolerance
@@ -53,7 +54,9 @@ def load(source: str, data: bytes | None, picture: bool) -> Answer:
                 f"load: '{source}' is no lens of dolens, and a file's name has a suffix; allowed: "
                 f"{', '.join(lens_names())}, or published/… of the tool 'lenses'"
             )
-        prescription, passed = load_prescription(source), []
+        # Whatever the folder is that the server was started in.
+        path = packaged_configuration() / "lens" / f"{source}.yaml"
+        prescription, passed = load_prescription(path), []
     else:
         read = read_lens(data, source)
         prescription, passed = read.prescription, list(read.passed_over)

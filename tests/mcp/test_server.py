@@ -16,6 +16,7 @@ from mcp import Client
 
 import dolens
 from dolens.errors import one_line
+from dolens.mcp.jobs import load
 from dolens.mcp.server import LensServer
 from dolens.mcp.tools import TOOLS, Tools
 from tests.cli.test_app import WITHOUT
@@ -247,6 +248,13 @@ def test_the_standard_output_belongs_to_the_protocol(folder):
     assert len(said[2]["tools"]) == len(TOOLS)
     assert said[3]["isError"] and "leads out of the folder" in said[3]["content"][0]["text"]
     assert rest == "" and complaints == "" and server.returncode == 0
+
+
+def test_a_file_beside_the_server_is_not_taken_for_a_lens_of_dolens(tmp_path, monkeypatch):
+    """`dolens.load_lens` would read it: its name is that of a file here."""
+    (tmp_path / "cooke_triplet").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    assert load("cooke_triplet", None, False).values["name"] == "Cooke triplet"
 
 
 @pytest.mark.parametrize(
