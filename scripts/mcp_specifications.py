@@ -21,9 +21,9 @@ says that the published one does not.  Limits:
   over all spots of at most what 90 % of the published lens's copies have.
 
 The policy knows the number of elements and which are cemented, and calls tools alone: search, which
-ends with real glasses; check each form; optimize and check again where a limit is missed; tolerance
-of what keeps all; export.  A second round takes up what failed, with more starts, forms and trials
-of glasses, and another seed.
+ends with real glasses; check each form; change the stop where the F-number alone is off, and
+optimize where another limit is missed, and check again; tolerance of what keeps all; export.  A
+second round takes up what failed, with more starts, forms and trials of glasses, and another seed.
 """
 
 import argparse
@@ -258,7 +258,16 @@ async def play(asked: dict[str, Any], player: Player, turn: int) -> dict[str, An
         return found
 
     for form in lenses["forms"] if lenses else ():
-        await checked(form["lens"])
+        found = await checked(form["lens"])
+        shown = None
+        if found is not None and found["broken"] == ["F-number"]:
+            # The search holds EFL over the pupil; the real ray at the sensor is asked for.
+            shown = await player.call("show", lens=form["lens"])
+        if shown is not None:
+            stop = shown["f_number"] * asked["f_number"] / found["f_number"]
+            stopped = await player.call("change", lens=form["lens"], changes={"f_number": stop})
+            if stopped is not None:
+                await checked(stopped["lens"])
     if tried and min(tried)[0]:
         better = await player.call(
             "optimize",
@@ -273,14 +282,6 @@ async def play(asked: dict[str, Any], player: Player, turn: int) -> dict[str, An
         )
         if better is not None:
             await checked(better["lens"])
-    if tried and min(tried)[3]["broken"] == ["F-number"]:
-        # That of the paraxial pupil is held by the search, and that of the real ray is asked for.
-        ratio = asked["f_number"] / min(tried)[3]["f_number"]
-        stopped = await player.call(
-            "change", lens=min(tried)[2], changes={"f_number": asked["f_number"] * ratio}
-        )
-        if stopped is not None:
-            await checked(stopped["lens"])
     for broken, spot, name, found in sorted(tried)[:2]:
         if done and (broken or fulfilled(done)):
             break
