@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import label
 from torch import Tensor
 
 from dolens.analysis.conditions import Conditions
@@ -36,6 +37,9 @@ from dolens.plotting.section import Profile, ray_paths, surface_profile
 # and over a beam; rays of a beam that place its grid well enough.
 _COARSE, _FINE, _BEAM, _ENOUGH = 33, 161, (15, 41), 60
 _NARROWINGS = 4
+# Neighbours on a grid, in its plane alone.
+_IN_PLANE = np.zeros((3, 3, 3), bool)
+_IN_PLANE[1] = True
 # Of all beams together, about.
 _RAYS = 20_000
 # Places along a line through a beam, of which its ends are found; and rays of a fan.
@@ -75,6 +79,24 @@ class Draft:
 
     @cached_property
     @torch.no_grad()
+    def _seeds(self) -> Tensor | None:
+        """Return where the chief rays of the paraxial entrance pupil cross the facing planes,
+        (F, 2), mm; None where beams are looked for without: they may be of several parts, or
+        nothing is known of them.
+        """
+        system = self.lens.system()
+        pupil = self.first.entrance_pupil.z.double()
+        parts = any(surface.aperture.obscuration is not None for surface in system.surfaces)
+        if parts or system.breaks or not bool(pupil.isfinite()):
+            return None
+        line, near = self._lines
+        n = line[:, 2]
+        across = torch.stack((-line[:, 0] * n, -line[:, 1] * n, 1.0 - n * n), -1) * pupil
+        across = across / (1.0 + n * n * near * pupil)[:, None]
+        return across[:, :2] - line[:, :2] * (across[:, 2] / (1.0 + n))[:, None]
+
+    @cached_property
+    @torch.no_grad()
     def boxes(self) -> Tensor:
         """Return corners (F, 2, 2), mm, of the rectangles of the facing planes that beams of the
         reference wavelength fill; NaN of a field that no light reaches.
@@ -92,7 +114,7 @@ class Draft:
         left, side = torch.arange(count), _COARSE
         for attempt in range(_NARROWINGS):
             q = _grid(box[left], side)
-            passes = self._traced(q, wave, left).valid
+            passes = self._in_beam(q, self._traced(q, wave, left).valid, left)
             step = (box[left, 1] - box[left, 0]) / (side - 1)
             low = torch.where(passes[..., None], q, math.inf).amin(1) - step
             high = torch.where(passes[..., None], q, -math.inf).amax(1) + step
@@ -107,24 +129,41 @@ class Draft:
                 break
         return found
 
+    def _in_beam(self, q: Tensor, passes: Tensor, which: Tensor) -> Tensor:
+        """Return which rays (F, N) of square grids q (F, N, 2) belong to the beam: those that pass,
+        and are neighbours' neighbours of the one nearest to the chief ray.
+
+        Where nothing but the stop clips, strongly aberrated rays may pass it far from their beam.
+        """
+        if self._seeds is None:
+            return passes
+        away = (q - self._seeds[which, None]).norm(dim=-1).where(passes, math.inf)
+        side = math.isqrt(q.shape[1])
+        parts, _ = label(passes.reshape(-1, side, side).numpy(), _IN_PLANE)
+        part = torch.from_numpy(parts).reshape(len(q), -1)
+        return passes & (part == part.gather(1, away.argmin(-1, keepdim=True)))
+
     @cached_property
     @torch.no_grad()
-    def rays(self) -> TracedRays:
-        """Return the beams (F, W, N) at the sensor."""
-        spots = len(self.where.fields) * len(self.where.wavelengths)
-        side = min(max(math.isqrt(_RAYS // spots), _BEAM[0]), _BEAM[1])
+    def _beams(self) -> tuple[TracedRays, Tensor]:
+        """Return beams (F, W, N) at the sensor, and which of their rays belong to them."""
+        count, waves = len(self.where.fields), self.where.wavelengths
+        side = min(max(math.isqrt(_RAYS // (count * len(waves))), _BEAM[0]), _BEAM[1])
         q = _grid(self.boxes.nan_to_num(0.0), side)
-        return self._traced(q[:, None], self.where.wavelengths[:, None])
+        hit = self._traced(q[:, None], waves[:, None])
+        every = torch.arange(count)
+        inside = [self._in_beam(q, passes, every) for passes in hit.valid.unbind(1)]
+        return hit, torch.stack(inside, 1) & self.boxes[:, :1, :1].isfinite()
 
     @cached_property
     def lit(self) -> Tensor:
         """Return (F,), whether a beam reaches the sensor: one ray, along the axis, may always."""
-        return (self.rays.valid.sum((-2, -1)) >= _BEAM[0]) & self.boxes[:, 0, 0].isfinite()
+        return self._beams[1].sum((-2, -1)) >= _BEAM[0]
 
     @cached_property
     def _light(self) -> Tensor:
         """Return shares (F, W·N) of rays in their fields' light, before apertures clip any."""
-        passes = self.rays.valid & self.lit[:, None, None]
+        passes = self._beams[1] & self.lit[:, None, None]
         return (passes * self.where.weights[:, None]).flatten(1)
 
     @cached_property
@@ -132,19 +171,19 @@ class Draft:
         """Return points (F, W, N, 2), mm, from the centroids of all wavelengths together, NaN of
         rays that do not pass; and RMS radii (F,), mm, NaN of dark fields.
         """
-        points = self.rays.position[..., :2]
+        points = self._beams[0].position[..., :2]
         centroid, square = moments(points.flatten(1, 2), self._light)
         points = points - centroid[:, None, None]
-        return points.where(self.rays.valid[..., None], math.nan), square.sqrt()
+        return points.where(self._beams[1][..., None], math.nan), square.sqrt()
 
     @cached_property
     def focus_shift(self) -> float:
         """Return how far behind the sensor, mm, the mean square of all spots is least; 0 where
         light does not depend on it.
         """
-        direction = self.rays.direction
+        direction = self._beams[0].direction
         slope = (direction[..., :2] / direction[..., 2:]).flatten(1, 2)
-        points = self.rays.position[..., :2].flatten(1, 2)
+        points = self._beams[0].position[..., :2].flatten(1, 2)
         share = self._light / self._light.sum(-1, keepdim=True).clamp(min=1e-30)
 
         def spread(a: Tensor, b: Tensor) -> Tensor:
@@ -169,6 +208,7 @@ class Draft:
             q = middle[:, None].repeat(1, _LINE, 1)
             q[..., axis] = box[:, :1, axis] * (1.0 - share) + box[:, 1:, axis] * share
             passes, along = self._traced(q, self.where.reference_wavelength).valid, q[..., axis]
+            passes = _about_the_middle(passes)
             low = torch.where(passes, along, math.inf).amin(-1)
             high = torch.where(passes, along, -math.inf).amax(-1)
             low, high = (e.where(low <= high, middle[:, axis])[:, None] for e in (low, high))
@@ -220,7 +260,8 @@ class Draft:
         Frequencies end at 1, 2 or 5 times a power of ten, where the sharpest field leaves little.
         """
         points, rms = self.spots
-        number = float(self.first.working_f_number.abs())
+        # Of a lens without power, which has no pupil that diffracts, zero.
+        number = float(self.first.working_f_number.abs().nan_to_num(0.0, 0.0))
         waves = 1e-6 * self.where.wavelengths
         cutoff = float(1.0 / (waves * number).min())
         end = min(cutoff, 0.68 / max(float(rms.nan_to_num(math.inf).min()), 1e-9))
@@ -245,14 +286,25 @@ class Draft:
 
     @property
     def airy_radius(self) -> float:
-        """Return Airy's radius at the reference wavelength, mm."""
-        number = float(self.first.working_f_number.abs())
+        """Return Airy's radius at the reference wavelength, mm; 0 of a lens without power."""
+        number = float(self.first.working_f_number.abs().nan_to_num(0.0, 0.0))
         return AIRY * 1e-6 * self.where.reference_wavelength * number
 
     def check(self) -> None:
         """Raise `InputError` where no light of the first field reaches the sensor."""
         if not bool(self.lit[0]):
             raise InputError("no ray of the first field reaches the sensor")
+
+
+def _about_the_middle(passes: Tensor) -> Tensor:
+    """Return those of rays (F, P) that pass with all between them and the middle one; where that
+    does not pass itself, all that do.
+    """
+    half = passes.shape[-1] // 2
+    behind = passes[:, half:].long().cumprod(-1)
+    before = passes[:, : half + 1].flip(-1).long().cumprod(-1).flip(-1)
+    together = torch.cat((before, behind[:, 1:]), -1).bool()
+    return torch.where(passes[:, half, None], together, passes)
 
 
 @torch.no_grad()

@@ -68,7 +68,7 @@ def numbers_of(seen: Seen) -> list[list[str]]:
 
 
 def _number(value: float, unit: str = "") -> str:
-    return f"{number_text(value, 4)} {unit}".strip() if abs(value) < 1e9 else "–"
+    return f"{number_text(value, 4)} {unit}".strip() if 0.0 < abs(value) < 1e9 else "–"
 
 
 @torch.no_grad()

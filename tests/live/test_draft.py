@@ -35,6 +35,12 @@ def test_rms_radii_are_those_of_the_spot_diagram(draft):
     torch.testing.assert_close(draft.spots[1], exact, rtol=0.06, atol=0.0)
 
 
+def test_rays_that_pass_the_stop_far_from_their_beam_are_none_of_it():
+    draft = draft_of("published/tessar_us2838978")  # where nothing but the stop clips
+    exact = spot_diagram(draft.lens, draft.where, 1000).polychromatic_rms
+    torch.testing.assert_close(draft.spots[1], exact, rtol=0.1, atol=0.0)
+
+
 def test_contrast_is_that_of_rays_times_that_of_a_perfect_lens(draft):
     frequencies, curves = draft.modulation()
     exact = modulation(draft.lens, draft.where, frequencies, 2000)

@@ -98,6 +98,23 @@ def test_of_many_changes_the_last_wins_and_none_is_lost(client):
 
 
 @pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("axicon_ring_focus", None),  # has no power
+        ("cassegrain_hoo_v2c18_3", "surface 1 is a mirror"),
+        ("spectrometer_prism", "names no sensor's diameter"),  # its axis is broken
+        ("eye_navarro_wide", "the sensor is curved"),
+    ],
+)
+def test_lenses_out_of_the_ordinary_are_shown_and_lack_a_photograph_for_a_reason(name, problem):
+    page = PlayPage(PlayedLens(load_lens(f"published/{name}"), name))
+    first, mtf, picture = (part() for part in page.parts())
+    json.dumps([first, mtf], allow_nan=False)
+    assert first["section"]["rays"][0] and first["spots"]["rms"][0] is not None
+    assert (problem or "") in picture.get("problem", "")
+
+
+@pytest.mark.parametrize(
     ("message", "said"),
     [
         ({"do": "change", "changes": {"thicknesses.1": -2.0}}, "negative thickness"),
