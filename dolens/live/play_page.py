@@ -43,7 +43,7 @@ _FILES = ("play.css", "play.js", "play_views.js")
 _TAKEN, _UNREADABLE = 4001, 4002
 _MOST_WAITING = 100
 # Seconds after which an answer is sent whole, whatever waits.
-_OFTEN = 0.15
+_OFTEN = 0.3
 Part = Callable[[], dict[str, Any]]
 
 

@@ -80,6 +80,7 @@ class LocalServer:
                 server_header=False,
                 ws_max_size=_MOST_BYTES,
                 ws_ping_interval=None,  # a machine may sleep
+                ws_per_message_deflate=False,
                 timeout_graceful_shutdown=_LAST_SECONDS,
             )
         )
@@ -141,7 +142,8 @@ def file_routes(files: Iterable[Path]) -> list[Route]:
 def _listening(port: int | None) -> socket.socket:
     if port is not None and not 1 <= port <= 65535:
         raise InputError(f"--port: {port}; allowed: 1 to 65535")
-    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    # Of a socket that does not name TCP asyncio leaves Nagle's delays on, 40 ms a message.
+    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((_HOST, port or 0))
