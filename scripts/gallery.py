@@ -91,12 +91,12 @@ def experiment_card(name: str, page: str | None) -> str:
     known = {one.name: one for one in experiments(configuration_folders(ROOT / "docs"))}
     settings = yaml.safe_load(SETTINGS.read_text(encoding="utf-8")) or {}
     shown, notes = pictured(name), [known[name].cost]
-    if shown != name:
-        notes.append(f"picture: {shown}" if shown else "no picture")
+    if shown and shown != name:
+        notes.append(f"picture of {shown}")
     elif name in settings:
         notes.append("picture of a shorter run")
     image = f"![](images/gallery/{shown}.webp){{ loading=lazy }}" if shown else ""
-    title = f"[{name}]({page})" if page else name
+    title = f"[{name}]({page or 'gallery.md'})"
     return card(image, title, known[name].summary, f"dolens train experiment={name}", notes)
 
 
