@@ -211,19 +211,25 @@ class Lens(LensRays, InStates, nn.Module):
             return self._kept_system.of(self, self._system)
         return self._system({**self.given, **(values or {})})
 
-    def with_values(self, values: Mapping[str, Tensor]) -> Self:
+    def with_values(self, values: Mapping[str, Tensor | float]) -> Self:
         """Return this lens as it is with other values, for all that is computed from it.
 
         It shares everything with this lens; `parameters` and `state_dict` are still the stored
         ones.  Gradients flow to the values.
 
         Args:
-            values: as `system` takes them; kept as `given`.
+            values: as `system` takes them, or numbers, as `{"sensor_distance": 95.9}`: mm, 1/mm and
+                radians; kept as `given`.
         """
         if not values:
             return self
         found = copy.copy(self)
-        found.given = {**self.given, **values}
+        options: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
+        tensors = {
+            name: value if isinstance(value, Tensor) else torch.tensor(value, **options)
+            for name, value in values.items()
+        }
+        found.given = {**self.given, **tensors}
         return found
 
     def as_stored(self) -> Self:

@@ -113,3 +113,11 @@ def test_a_lens_without_edges_has_the_given_values_and_their_gradients():
     slopes = torch.autograd.grad(hit.position[0, 1], [values[name] for name in names])
     assert all(float(slope) != 0.0 for slope in slopes)
     assert opened.get_parameter("thicknesses.1") is lens.get_parameter("thicknesses.1")
+
+
+def test_numbers_are_values_too_in_the_lens_s_precision():
+    lens = load_lens("cooke_triplet", dtype=torch.float32)
+    moved = lens.with_values({"sensor_distance": 42.5})
+    assert moved.given["sensor_distance"].dtype == torch.float32
+    shift = (moved.system().vertices[-1] - lens.system().vertices[-1]).item()
+    assert shift == pytest.approx(42.5 - lens.sensor_distance.item(), abs=1e-4)
