@@ -57,18 +57,18 @@ def numbers_of(seen: Seen) -> list[list[str]]:
         ["F-number" if where.object_distance is None else "working F-number", _number(working)],
         ["entrance pupil", _number(float(first.entrance_pupil.diameter), "mm")],
         ["track", _number(track, "mm")],
-        ["Airy radius", _number(1e3 * draft.airy_radius, "µm")],
+        ["Airy radius", _number(1e3 * draft.airy_radius or math.inf, "µm")],
         [
             "focus is off by",
             _number(draft.focus_shift, "mm")
             if abs(draft.focus_shift) >= 1.0
-            else _number(1e3 * draft.focus_shift, "µm"),
+            else _number(round(1e3 * draft.focus_shift, 3), "µm"),
         ],
     ]
 
 
 def _number(value: float, unit: str = "") -> str:
-    return f"{number_text(value, 4)} {unit}".strip() if 0.0 < abs(value) < 1e9 else "–"
+    return f"{number_text(value, 4)} {unit}".strip() if abs(value) < 1e9 else "–"
 
 
 @torch.no_grad()

@@ -212,8 +212,11 @@ class _Session:
             while True:
                 self._receive(await self._socket.receive_text())
         finally:
-            for task in (answering, *self._tasks):
+            tasks = [answering, *self._tasks]
+            for task in tasks:
                 task.cancel()
+            # A browser that has gone takes no answer, and nobody asks why.
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     def _receive(self, text: str) -> None:
         try:
