@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 
@@ -175,6 +176,15 @@ def test_a_lens_from_a_stranger_is_a_sentence_on_the_page(run_copy):
     assert "surfaces.99.curvature" in RunPage(run_copy).frame(0)["section"]
     (run_copy / "lens" / "initial.yaml").write_text("surfaces: [")
     assert isinstance(RunPage(run_copy).frame(0)["section"], str)
+
+
+def test_a_run_without_a_history_shows_what_it_has(run_copy):
+    shutil.rmtree(run_copy / FOLDER)
+    (run_copy / "figures").mkdir(exist_ok=True)
+    (run_copy / "figures" / "layout.png").write_bytes(b"")
+    state = RunPage(run_copy).state()
+    assert "no history" in state["note"] and state["status"] == "finished"
+    assert "test/psnr_db" in state["metrics"] and state["figures"] == ["layout.png"]
 
 
 def test_files_outside_of_the_history_are_not_given(run_copy):
