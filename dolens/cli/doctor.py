@@ -21,6 +21,7 @@ EXTRAS = {
     "bm3d": "network=wiener_bm3d; not for commercial use",
     "mlflow": "logger=mlflow",
     "wandb": "logger=wandb",
+    "live": "dolens play, dolens watch, train live=true",
     "mcp": "dolens mcp",
     "docs": "the documentation site and its notebooks",
 }

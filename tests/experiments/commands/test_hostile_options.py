@@ -27,6 +27,7 @@ BASE = {
     "convert": ["asphere", "new.yaml"],
     "check": ["lenses"],
     "experiments": [],
+    "watch": ["run"],
     "evaluate": ["run"],
     "apply": ["run", "picture.png"],
     "compare": ["run"],

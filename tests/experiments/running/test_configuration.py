@@ -70,7 +70,7 @@ def test_the_command_line_drops_and_replaces_too(composed):
         ("cooke_sensitivity", "tolerances: {'thicknesses.[135]': drop}", 4),
         ("misalignment", "fits: {'30': drop, '25': drop}", 3),
         ("wavefront_coding", "miscalibrations: {noise: drop}", 2),
-        ("wavefront_coding", "callbacks: {pictures: drop}", 6),
+        ("wavefront_coding", "callbacks: {pictures: drop}", 8),
         ("speed_vs_error", "scenes: {nikon: drop}", 3),
     ],
 )
