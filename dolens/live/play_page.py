@@ -88,7 +88,7 @@ class PlayPage:
         await socket.accept()
         before, self._current = self._current, socket
         if before is not None:
-            with suppress(RuntimeError):  # it has gone by itself
+            with suppress(RuntimeError, WebSocketDisconnect):  # it has gone by itself
                 await before.close(_TAKEN, "opened in another window")
         session = _Session(self, socket)
         with suppress(WebSocketDisconnect):

@@ -166,6 +166,21 @@ def test_the_browser_that_came_last_has_the_lens(server):
         assert closed.value.rcvd.code == 4001
 
 
+def test_a_browser_that_breaks_off_leaves_the_lens_to_the_next(server):
+    address = server.address.replace("http", "ws", 1) + "socket"
+    for radius in (21.0, 21.5):
+        with connect(address, max_size=None) as socket:
+            client = Client(socket)
+            client.send(do="change", changes={"surfaces.1.radius": radius}, done=True)
+            client.next("seen")
+            client.send(do="look")
+            socket.socket.close()
+    with connect(address, max_size=None) as socket:
+        client = Client(socket)
+        assert client.first[0]["values"]["surfaces.1.curvature"] == 1.0 / 21.5
+        assert client.first[0]["undo"] == 2
+
+
 @pytest.mark.browser
 def test_a_person_drags_a_radius_undoes_it_and_saves(server, page):
     page.goto(server.address)
