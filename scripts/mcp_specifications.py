@@ -257,17 +257,23 @@ async def play(asked: dict[str, Any], player: Player, turn: int) -> dict[str, An
             tried.append((len(found["broken"]), spot["value"], name, found))
         return found
 
+    async def opened(name: str, wider: float = 1.0) -> None:
+        """Check a lens whose stop is wider by a factor, and whose other apertures let all pass."""
+        shown = await player.call("show", lens=name)
+        if shown is not None:
+            stop = str(shown["stop_surface"])
+            changes = {f"surfaces.{n}.semi_diameter": "auto" for n in shown["surfaces"]}
+            radius = wider * shown["surfaces"][stop]["semi_diameter"]
+            changes[f"surfaces.{stop}.semi_diameter"] = radius
+            changed = await player.call("change", lens=name, changes=changes)
+            if changed is not None:
+                await checked(changed["lens"])
+
     for form in lenses["forms"] if lenses else ():
         found = await checked(form["lens"])
-        shown = None
         if found is not None and found["broken"] == ["F-number"]:
             # The search holds EFL over the pupil; the real ray at the sensor is asked for.
-            shown = await player.call("show", lens=form["lens"])
-        if shown is not None:
-            stop = shown["f_number"] * asked["f_number"] / found["f_number"]
-            stopped = await player.call("change", lens=form["lens"], changes={"f_number": stop})
-            if stopped is not None:
-                await checked(stopped["lens"])
+            await opened(form["lens"], found["f_number"] / asked["f_number"])
     if tried and min(tried)[0]:
         better = await player.call(
             "optimize",
@@ -281,7 +287,7 @@ async def play(asked: dict[str, Any], player: Player, turn: int) -> dict[str, An
             iterations=30,
         )
         if better is not None:
-            await checked(better["lens"])
+            await opened(better["lens"])
     for broken, spot, name, found in sorted(tried)[:2]:
         if done and (broken or fulfilled(done)):
             break

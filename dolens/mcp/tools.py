@@ -145,7 +145,8 @@ class Tools:
             dict[str, Any],
             Field(
                 description="path → value, as {'surfaces.1.radius': 21.5, 'surfaces.2.material': "
-                "'SCHOTT:N-SF5', 'f_number': 4, 'fields.angles': [[0, 0], [0, 14]]}; lengths mm",
+                "'SCHOTT:N-SF5', 'f_number': 4, 'fields.angles': [[0, 0], [0, 14]]}; lengths mm; "
+                "a semi_diameter of 'auto' lets the light of the fields pass",
                 max_length=200,
             ),
         ],
