@@ -20,13 +20,18 @@ from dolens.experiments.commands.apply import PictureCamera
 from dolens.experiments.commands.apply_lens import AppliedLens
 from dolens.experiments.running.command_line import prepared
 from dolens.lens_page.page import Written
+from dolens.live.serve import LocalServer
 
 # How a command is called beside the option that is tried.
 BASE = {
     "show": ["asphere"],
     "convert": ["asphere", "new.yaml"],
     "check": ["lenses"],
+    "doctor": [],
     "experiments": [],
+    "mcp": ["lenses"],
+    "new": ["my_camera"],
+    "play": ["asphere"],
     "watch": ["run"],
     "evaluate": ["run"],
     "apply": ["run", "picture.png"],
@@ -122,6 +127,7 @@ def at_work(work, monkeypatch):
     for name in ("apply", "restore"):
         monkeypatch.setattr(PictureCamera, name, lambda *_: [])
     monkeypatch.setattr(AppliedLens, "apply", lambda *_: [])
+    monkeypatch.setattr(LocalServer, "run", lambda _: None)
 
 
 def said(given):
