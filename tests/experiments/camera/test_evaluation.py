@@ -128,5 +128,6 @@ def test_a_camera_is_scored_on_a_gpu_as_on_the_cpu(made, monkeypatch):
         found = scored("cuda")
     assert {("test", "tv_psnr_db"), ("test_wave", "psnr_db")} < set(expected)
     assert found.keys() == expected.keys()
+    # dB: rays of single precision round otherwise without kernels, and on each processor.
     for name, scores in expected.items():
-        assert torch.allclose(found[name], scores, atol=1e-3), name
+        assert torch.allclose(found[name], scores, atol=5e-3), name
