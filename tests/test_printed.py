@@ -223,9 +223,9 @@ def test_a_command_about_a_lens_runs(words, in_it, here, monkeypatch):
     assert done.exit_code == 0, (done.output, done.exception)
 
 
-@those("apply", "evaluate", "compare", "report", "mcp", "watch")
-def test_a_command_about_a_run_takes_the_arguments(words, in_it, here):
-    """It runs in tests/test_tutorials.py, tests/experiments and tests/mcp; that of a lens here."""
+@those("apply", "evaluate", "compare", "report", "mcp", "watch", "play", "new", "doctor")
+def test_a_command_that_runs_elsewhere_takes_the_arguments(words, in_it, here):
+    """It runs in the tests of tutorials, experiments, pages and servers; that of a lens here."""
     if kind_of(words) == "apply" and "lens.zmx" in words:
         Image.effect_noise((60, 40), 50).convert("RGB").save(here / "picture.jpg")
         done = CliRunner().invoke(app, list(words[1:]))
