@@ -6,15 +6,14 @@ from typing import Annotated
 import typer
 
 from dolens.cli.extras import import_extra, quiet_logging
+from dolens.cli.local_page import Port
 from dolens.errors import InputError, readable
 from dolens.files import resolved_path
 
 
 def watch(
     run: Annotated[Path, typer.Argument(help="The folder of a run.", metavar="RUN")],
-    port: Annotated[
-        int | None, typer.Option(help="Of this machine; by default a free one.")
-    ] = None,
+    port: Port = None,
     idle: Annotated[
         float | None,
         typer.Option(

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dolens.errors import InputError, readable
 from dolens.files import installed_version, written_whole
-from dolens.html import rendered
 
 logger = logging.getLogger(__name__)
 
@@ -94,6 +93,8 @@ class PhotographPage:
         """
         if not self._photographs:
             raise InputError(f"{path}: there are no photographs to show")
+        from dolens.html import rendered  # loads jinja2, which pictures do without
+
         page = rendered(
             _TEMPLATE,
             filters={"number": number_text},
