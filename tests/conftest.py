@@ -15,9 +15,9 @@ import yaml
 
 from dolens import Lens, load_lens
 from dolens.prescriptions import lens_from_prescription
-from tests.browser import chromium, page
+from tests.browser import chromium, page, run_async
 
-__all__ = ["chromium", "page"]
+__all__ = ["chromium", "page", "run_async"]
 
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.

@@ -1,8 +1,5 @@
 import copy
-import os
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import pytest
@@ -93,32 +90,6 @@ def page(hostile_lens, tmp_path_factory):
 @pytest.fixture(scope="session")
 def parsed(page):
     return Page(page[0].read_text(encoding="utf-8"))
-
-
-@pytest.fixture(scope="session")
-def chromium(tmp_path_factory):
-    """Runs headless Chromium on a file with some options, and returns what it prints."""
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    if program is None:
-        pytest.skip("there is no chromium on this machine")
-
-    def run(path, *options):
-        profile = tmp_path_factory.mktemp("chromium")
-        quiet = (
-            *("--disable-quic", "--no-first-run", "--disable-background-networking"),
-            *("--disable-component-update", "--disable-sync", "--hide-scrollbars"),
-            *("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=6000"),
-        )
-        done = subprocess.run(
-            [program, *quiet, f"--user-data-dir={profile}", *options, path.as_uri()],
-            capture_output=True,
-            timeout=120,
-            check=True,
-            env={**os.environ, "HOME": str(profile)},
-        )
-        return done.stdout.decode()
-
-    return run
 
 
 def number_in(text):

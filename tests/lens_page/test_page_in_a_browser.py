@@ -1,56 +1,41 @@
 """A page is laid out by a browser: nothing is cut off, empty or blank, on a laptop or a phone."""
 
-import json
-import re
-from html import unescape
-
-import numpy as np
 import pytest
-from PIL import Image
 
-# What a browser knows of the layout, written into the page for --dump-dom.
-MEASURE = """
-<pre id="measured"></pre>
-<script>
-window.addEventListener("load", () => setTimeout(() => {
+from tests.browser import pixels_of
+
+MEASURE = """() => {
   const box = (e) => { const b = e.getBoundingClientRect();
     return [b.left, b.top + scrollY, b.width, b.height].map(Math.round); };
   const viewer = document.getElementById("viewer");
-  document.getElementById("measured").textContent = JSON.stringify({
+  return {
     width: innerWidth, scroll: document.documentElement.scrollWidth,
     sections: [...document.querySelectorAll("section")].map(box),
     figures: [...document.querySelectorAll("figure svg")].map(box),
     tables: [...document.querySelectorAll(".scroll")].map(box),
-    canvas: box(viewer.querySelector("canvas")),
-    drawn: viewer.dataset.drawn, renderer: viewer.dataset.renderer,
-  });
-}, 500));
-</script>
-</body>"""
+    canvas: box(viewer.querySelector("canvas")), renderer: viewer.dataset.renderer,
+  };
+}"""
 LAPTOP, PHONE = 1280, 390
 
 
 @pytest.fixture(scope="module")
-def measured(page, chromium):
-    """Widths of the viewport → what the browser measured in a frame of that width."""
-    inner = page[0].parent / "measured.html"
-    inner.write_text(page[0].read_text(encoding="utf-8").replace("</body>", MEASURE))
+def looked_at(page, chromium):
+    """Widths of the screen → what the browser measured there, and the whole page's pixels."""
 
-    def measure(width):
-        # A window of a browser may not be as narrow as a phone; a frame may.
-        outer = page[0].parent / f"frame{width}.html"
-        outer.write_text(
-            f'<iframe id="f" src="measured.html" style="width:{width}px;height:900px;border:0">'
-            '</iframe><pre id="out"></pre><script>setInterval(() => {'
-            'const found = f.contentDocument && f.contentDocument.getElementById("measured");'
-            "if (found && found.textContent) out.textContent = found.textContent; }, 100)</script>"
-        )
-        dom = chromium(
-            outer, "--dump-dom", "--allow-file-access-from-files", "--window-size=1400,1000"
-        )
-        return json.loads(unescape(re.search(r'<pre id="out">(.*?)</pre>', dom, re.DOTALL)[1]))
+    def look(width):
+        with chromium.new_context(viewport={"width": width, "height": 900}) as context:
+            opened = context.new_page()
+            opened.goto(page[0].as_uri())
+            opened.locator("#viewer[data-drawn=yes]").wait_for()
+            return opened.evaluate(MEASURE), pixels_of(opened.screenshot(full_page=True))
 
-    return {width: measure(width) for width in (LAPTOP, PHONE)}
+    return {width: look(width) for width in (LAPTOP, PHONE)}
+
+
+@pytest.fixture
+def measured(looked_at):
+    return {width: found for width, (found, _) in looked_at.items()}
 
 
 @pytest.mark.browser
@@ -74,14 +59,9 @@ def test_every_figure_has_a_size(measured, width):
 
 
 @pytest.mark.browser
-def test_figures_and_the_view_in_space_show_something(page, measured, chromium):
-    found = measured[LAPTOP]
-    assert found["drawn"] == "yes"
+def test_figures_and_the_view_in_space_show_something(looked_at):
+    found, pixels = looked_at[LAPTOP]
     assert found["renderer"] in ("webgl", "canvas")
-    height = max(top + down for _, top, _, down in found["sections"]) + 50
-    picture = page[0].parent / "page.png"
-    chromium(page[0], f"--screenshot={picture}", f"--window-size={LAPTOP},{height}")
-    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(float)
     assert pixels.shape[1] == LAPTOP
     for left, top, across, down in (*found["figures"], found["canvas"]):
         part = pixels[top : top + down, left : left + across]

@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 
-import anyio
 import pytest
 import torch
 from mcp import Client
@@ -94,7 +93,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def played(folder):
+def played(folder, run_async):
     """All calls, and then all that are refused, in one session: name → result."""
 
     async def play():
@@ -106,7 +105,7 @@ def played(folder):
                 found[name] = await client.call_tool(tool, arguments)
         return found
 
-    return anyio.run(play)
+    return run_async(play)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +203,7 @@ def test_lenses_of_the_session_have_names_and_the_folder_is_listed(played):
     assert bent["surfaces"]["1"]["radius"] == 22.5 and bent["lens"] == "bent"
 
 
-def test_a_call_that_runs_out_of_time_leaves_the_server_alive(folder):
+def test_a_call_that_runs_out_of_time_leaves_the_server_alive(folder, run_async):
     async def play():
         server = LensServer(folder)
         server.lens_session.worker = type(server.lens_session.worker)(0.2, JOBS)
@@ -215,7 +214,7 @@ def test_a_call_that_runs_out_of_time_leaves_the_server_alive(folder):
                 await session.run("sleep", seconds=60)
             return await client.call_tool("load", {"source": "../x.yaml"})
 
-    assert anyio.run(play).is_error
+    assert run_async(play).is_error
 
 
 def test_the_standard_output_belongs_to_the_protocol(folder):

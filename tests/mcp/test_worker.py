@@ -15,15 +15,16 @@ from dolens.mcp.worker import Worker
 JOBS = "tests.mcp.jobs_of_a_test"
 
 
-def refusal(worker, job, **arguments):
+@pytest.fixture
+def refusal(worker, run_async):
     """What a job is refused with, as text."""
 
-    async def run():
-        await worker.run(job, arguments)
+    def refusal(job, **arguments):
+        with pytest.raises(InputError) as refused:
+            run_async(worker.run, job, arguments)
+        return str(refused.value)
 
-    with pytest.raises(InputError) as refused:
-        anyio.run(run)
-    return str(refused.value)
+    return refusal
 
 
 @pytest.fixture
@@ -33,25 +34,25 @@ def worker():
     worker.stop()
 
 
-def test_every_job_ends_in_time_and_the_next_one_runs(worker, capfd):
+def test_every_job_ends_in_time_and_the_next_one_runs(worker, refusal, run_async, capfd):
     started = time.perf_counter()
-    assert refusal(worker, "sleep", seconds=60).startswith("sleep: took more than 0.5 s and was")
+    assert refusal("sleep", seconds=60).startswith("sleep: took more than 0.5 s and was")
     assert time.perf_counter() - started < 30.0
-    assert refusal(worker, "refuse") == "no such thing"
-    assert refusal(worker, "fail") == "fail: an error of dolens itself: KeyError"
-    assert refusal(worker, "end").startswith("end: its process ended")
+    assert refusal("refuse") == "no such thing"
+    assert refusal("fail") == "fail: an error of dolens itself: KeyError"
+    assert refusal("end").startswith("end: its process ended")
 
     async def say():
         return await worker.run("say", {}), await worker.run("say", {})
 
     # One process goes on with jobs, and what they print is not on the standard output.
-    first, second = anyio.run(say)
+    first, second = run_async(say)
     assert first == second
     said = capfd.readouterr()
     assert said.out == "" and said.err.count("in the way of the protocol") == 2
 
 
-def test_a_call_that_is_given_up_ends_its_job(worker):
+def test_a_call_that_is_given_up_ends_its_job(worker, run_async):
     async def give_up():
         await worker.run("say", {})
         with anyio.move_on_after(0.1):
@@ -59,7 +60,7 @@ def test_a_call_that_is_given_up_ends_its_job(worker):
         assert worker._process is None
         return await worker.run("sleep", {"seconds": 0})
 
-    assert anyio.run(give_up) == "awake"
+    assert run_async(give_up) == "awake"
 
 
 SERVER = """
