@@ -38,7 +38,10 @@ ALLOWED = {
         "optimize",
     },
     "reconstruction": {"errors", "optics", "sensor", "rendering", "photograph_page"},
-    "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
+    "plotting": {
+        *("errors", "optics", "analysis", "diffraction", "photograph_page"),
+        *("sensor", "rendering"),
+    },
     "views": {
         *("errors", "optics", "sensor", "analysis", "diffraction", "rendering", "plotting"),
         "optimize",

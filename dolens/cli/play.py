@@ -6,16 +6,11 @@ from typing import Annotated
 import typer
 
 from dolens.cli.local_page import Open, Port, serve_until_ctrl_c
+from dolens.cli.show import LensFile
 
 
 def play(
-    lens: Annotated[
-        str,
-        typer.Argument(
-            help="A lens file (.yaml, .json, .zmx, .seq, .len, .roa, .txt), or the name of a "
-            "lens of dolens."
-        ),
-    ],
+    lens: LensFile,
     picture: Annotated[
         Path | None, typer.Option(help="A picture to photograph through the lens.")
     ] = None,

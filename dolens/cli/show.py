@@ -14,14 +14,17 @@ if TYPE_CHECKING:
     from dolens.optics.lens import Lens
 
 
+LensFile = Annotated[
+    str,
+    typer.Argument(
+        help="A lens file (.yaml, .json, .zmx, .seq, .len, .roa, .txt), or the name of a "
+        "lens of dolens."
+    ),
+]
+
+
 def show(
-    lens: Annotated[
-        str,
-        typer.Argument(
-            help="A lens file (.yaml, .json, .zmx, .seq, .len, .roa, .txt), or the name of a "
-            "lens of dolens."
-        ),
-    ],
+    lens: LensFile,
     html: Annotated[
         Path | None,
         typer.Option(help="Write a page of figures and tables to this file; it needs no network."),

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from dolens.live.play import Seen
 from dolens.optics.fields import field_label
-from dolens.optics.materials import is_glass
-from dolens.plotting.section import element_edges, ground_edge, sensor_curve
+from dolens.plotting.section import drawn_surfaces, glass_sections, sensor_curve, stop_bars
 from dolens.plotting.style import number_text, ordered_colours, spectral_colour
 
 # Of a section: rays of a field, and how far in front of the lens they begin, over its length with
@@ -76,27 +75,6 @@ def section_of(seen: Seen) -> dict[str, Any]:
     """Return the section in the y-z plane: lists of z and y, mm."""
     draft, profiles = seen.draft, seen.profiles
     system = draft.lens.system()
-    glasses, bounding = [], set[int]()
-    for number, other in system.neighbours:
-        front, back = profiles[number - 1], profiles[other - 1]
-        if not is_glass(system.materials[number]) or not (len(front[0]) and len(back[0])):
-            continue
-        bounding |= {number, other}
-        if system.breaks or system.elements:
-            top, bottom = element_edges(system, (number, other), front, back)
-        else:
-            top, bottom = (ground_edge(front, back, end) for end in (-1, 0))
-        faces = [np.stack(face, -1) for face in (front, back)]
-        outline = [faces[0], top, faces[1][::-1], bottom[::-1]]
-        glasses.append(_points(np.concatenate(outline)))
-    surfaces = []
-    for number, (z, y) in enumerate(profiles, 1):
-        mirror = number in system.mirrors
-        if len(z) and (
-            mirror or number in bounding or (system.refracts(number) and number != system.stop)
-        ):
-            points = _points(np.stack((z, y), -1))
-            surfaces.append({"number": number, "mirror": mirror, "points": points})
     drawn = [np.stack(profile, -1) for profile in profiles if len(profile[0])]
     every = np.concatenate(drawn)
     height = float(np.abs(every[:, 1]).max())
@@ -104,14 +82,19 @@ def section_of(seen: Seen) -> dict[str, Any]:
     sensor = sensor_curve(system, half)
     first, last = float(every[:, 0].min()), float(max(every[:, 0].max(), sensor[:, 0].max()))
     rays = draft.section_rays(first - _LEAD * (last - first), _RAYS)
-    stop = []
-    z, y = profiles[system.stop - 1]
-    if len(z):
-        stop = [_points(np.array([[z[i], y[i]], [z[i], y[i] * 1.25]])) for i in (0, -1)]
+    y = profiles[system.stop - 1][1]
+    bars = stop_bars(system, profiles[system.stop - 1], 0.25 * float(np.abs(y).max(initial=0.0)))
     return {
-        "glasses": glasses,
-        "surfaces": surfaces,
-        "stop": stop,
+        "glasses": [_points(glass.outline) for glass in glass_sections(system, profiles)],
+        "surfaces": [
+            {
+                "number": number,
+                "mirror": number in system.mirrors,
+                "points": _points(np.stack(profiles[number - 1], -1)),
+            }
+            for number in drawn_surfaces(system, profiles)
+        ],
+        "stop": [_points(bar) for bar in bars],
         "sensor": _points(sensor),
         "rays": [[_points(path) for path in paths] for paths in rays],
     }

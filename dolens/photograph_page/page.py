@@ -116,7 +116,7 @@ def _parts(photograph: ShownPhotograph, room: int) -> list[ShownPhotograph]:
     side = min(_DETAIL, int(math.sqrt(room / 4.0)), height, width)
     times = math.ceil(math.sqrt(height * width / (room - side * side)))
     small = {label: reduced(image, times) for label, image in photograph.pictures.items()}
-    top, left = _most_detailed(next(iter(photograph.pictures.values())), side)
+    top, left = most_detailed(next(iter(photograph.pictures.values())), side)
     part = (slice(None), slice(top, top + side), slice(left, left + side))
     place = f"rows {top} to {top + side}, columns {left} to {left + side}"
     notes = (
@@ -137,14 +137,20 @@ def reduced(image: Tensor, times: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(found, times, ceil_mode=True, count_include_pad=False)[0]
 
 
-def _most_detailed(image: Tensor, side: int) -> tuple[int, int]:
-    """Return the first row and column of the square that has the most detail, in steps of half."""
-    step = max(side // 2, 1)
-    grey = image.detach().float().mean(0)
-    slopes = grey.diff(dim=0)[:, :-1].abs() + grey.diff(dim=1)[:-1].abs()
-    sums = torch.nn.functional.avg_pool2d(slopes[None], max(side - 1, 1), step)[0]
-    place = int(sums.argmax())
-    return place // sums.shape[1] * step, place % sums.shape[1] * step
+def most_detailed(image: Tensor, side: int) -> tuple[int, int]:
+    """Return the first row and column of the square whose neighbouring pixels differ most.
+
+    Args:
+        image: (3, H, W).
+        side: of the square, pixels; squares are tried in steps of a quarter of it.
+    """
+    grey = image.detach().float().mean(dim=0, keepdim=True)
+    detail = grey.diff(dim=-1)[:, :-1].square() + grey.diff(dim=-2)[..., :-1].square()
+    step = max(1, side // 4)
+    size = min(side, *detail.shape[-2:])
+    sums = torch.nn.functional.avg_pool2d(detail[None], size, stride=step)[0, 0]
+    row, column = divmod(int(sums.argmax()), sums.shape[1])
+    return row * step, column * step
 
 
 def picture_bytes(image: Tensor, lossless: bool = True) -> bytes:

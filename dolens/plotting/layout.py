@@ -13,7 +13,6 @@ from matplotlib.patches import Polygon
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.section import (
@@ -21,10 +20,12 @@ from dolens.plotting.section import (
     Profile,
     axis_angle,
     broken_axis,
-    element_edges,
+    drawn_surfaces,
+    glass_sections,
     obscuration_profiles,
     sensor_curve,
     sensor_line,
+    stop_bars,
     surface_profile,
     trace_fan,
 )
@@ -341,26 +342,15 @@ def _draw_axis(axes: Axes, points: np.ndarray) -> None:
 
 def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) -> None:
     """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
-    bounding: set[int] = set()
-    for number, other in system.neighbours:
-        if is_glass(system.materials[number]):
-            bounding |= {number, other}
-            faces = profiles[number - 1], profiles[other - 1]
-            if not (len(faces[0][0]) and len(faces[1][0])):
-                continue
-            top, bottom = element_edges(system, (number, other), *faces)
-            front, back = (np.stack(p, -1) for p in faces)
-            outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
-            gid = f"glass {number}"
-            axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
-            for edge in (top, bottom):
-                axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
-    for number, (z, y) in enumerate(profiles, 1):
-        mirror = number in system.mirrors
-        refracts = system.refracts(number)
-        if mirror or number in bounding or (refracts and number != system.stop):
-            width = 2.2 if mirror else 1.0
-            axes.plot(z, y, color=_EDGE, linewidth=width, gid=f"surface {number}", zorder=2)
+    for number, outline, edges in glass_sections(system, profiles):
+        gid = f"glass {number}"
+        axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
+        for edge in edges:
+            axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
+    for number in drawn_surfaces(system, profiles):
+        width = 2.2 if number in system.mirrors else 1.0
+        gid = f"surface {number}"
+        axes.plot(*profiles[number - 1], color=_EDGE, linewidth=width, gid=gid, zorder=2)
 
 
 def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
@@ -412,19 +402,14 @@ def _draw_stop(
     axes: Axes, system: OpticalSystem, profiles: Sequence[Profile], height: float
 ) -> None:
     """Draw bars outside the stop's edge, in its plane, with a tick along its axis at the edge."""
-    z, y = profiles[system.stop - 1]
-    if not len(z):
-        return
+    profile = profiles[system.stop - 1]
+    length = _stop_bar(system.stop, profiles, height)
+    length -= float(np.abs(profile[1]).max(initial=0.0))
     angle = axis_angle(system, system.stop)
-    along = np.array([math.cos(angle), math.sin(angle)])
-    outwards = np.array([-along[1], along[0]])
-    tick = 0.025 * height * along
-    length = _stop_bar(system.stop, profiles, height) - float(np.abs(y).max())
-    for end, side in ((-1, 1.0), (0, -1.0)):
-        rim = np.array([z[end], y[end]])
-        bar = np.stack([rim, rim + side * length * outwards]).T
-        axes.plot(*bar, color="black", linewidth=2.0, solid_capstyle="butt", gid="stop", zorder=4)
-        ends = np.stack([rim - tick, rim + tick]).T
+    tick = 0.025 * height * np.array([math.cos(angle), math.sin(angle)])
+    for bar in stop_bars(system, profile, length):
+        axes.plot(*bar.T, color="black", linewidth=2.0, solid_capstyle="butt", gid="stop", zorder=4)
+        ends = np.stack([bar[0] - tick, bar[0] + tick]).T
         axes.plot(*ends, color="black", linewidth=1.2, gid="stop tick", zorder=4)
 
 

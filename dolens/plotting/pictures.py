@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dolens.errors import InputError
+from dolens.photograph_page.page import most_detailed
 from dolens.plotting.style import PAGE, SMALL, TITLE, draw_note, draw_title, plain_text, scale_bar
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
@@ -126,7 +127,7 @@ def applied_figure(
     first = next(iter(images.values()))
     height, width = first.shape[-2:]
     side = min(_PART, height, width)
-    top, left = _most_detailed(first, side)
+    top, left = most_detailed(first, side)
     tall = min(max(height / width, 0.3), 2.0) * _PANEL
     figure = Figure(figsize=(_PANEL * len(images) + 0.2, tall + _PANEL + 0.8), layout="constrained")
     axes = figure.subplots(2, len(images), squeeze=False, height_ratios=(tall, _PANEL))
@@ -151,17 +152,6 @@ def applied_figure(
             panel.spines[:].set_visible(False)
     draw_title(figure, title)
     return figure
-
-
-def _most_detailed(image: Tensor, side: int) -> tuple[int, int]:
-    """The first row and column of the square whose neighbouring pixels differ most."""
-    grey = image.mean(dim=0, keepdim=True)
-    detail = grey.diff(dim=-1)[:, :-1].square() + grey.diff(dim=-2)[..., :-1].square()
-    step = max(1, side // 4)
-    size = min(side, *detail.shape[-2:])
-    found = functional.avg_pool2d(detail[None], size, stride=step)[0, 0]
-    row, column = divmod(int(found.argmax()), found.shape[1])
-    return row * step, column * step
 
 
 def _shrunk(image: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """The meridional section of a lens is computed: surface profiles, edges of elements, ray fans."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.optics.surfaces import GRAZING
@@ -181,6 +183,8 @@ def element_edges(
 
     They run along the axis of the element that carries both faces.
     """
+    if not (system.breaks or system.elements):
+        return ground_edge(front, back, -1), ground_edge(front, back, 0)
     number, other = numbers
     axes = system.axes
     together = axes[number - 1].together(axes[other - 1])
@@ -214,6 +218,77 @@ def ground_edge(front: Profile, back: Profile, end: int) -> np.ndarray:
     beyond = np.abs(outer[1]) >= abs(inner[1][end])
     gap = (outer[0][beyond] - corner[0]) * (1.0 if outer is back else -1.0)
     return np.stack([a, b]) if gap.min(initial=np.inf) < 0.0 else np.stack([a, corner, b])
+
+
+class GlassSection(NamedTuple):
+    """The section of a piece of glass: points (N, 2) are z and y, mm.
+
+    Attributes:
+        number: of the surface in front.
+        outline: of the glass, a closed polygon.
+        edges: ground edges, upper and lower.
+    """
+
+    number: int
+    outline: np.ndarray
+    edges: tuple[np.ndarray, np.ndarray]
+
+
+def glass_sections(system: OpticalSystem, profiles: Sequence[Profile]) -> list[GlassSection]:
+    """Return the sections of all glass whose two surfaces have a profile.
+
+    Args:
+        system: the lens.
+        profiles: of its surfaces in order, from the lower rim to the upper one.
+    """
+    found = []
+    for number, other in system.neighbours:
+        front, back = profiles[number - 1], profiles[other - 1]
+        if is_glass(system.materials[number]) and len(front[0]) and len(back[0]):
+            top, bottom = element_edges(system, (number, other), front, back)
+            faces = np.stack(front, -1), np.stack(back, -1)[::-1]
+            outline = np.concatenate([faces[0], top[1:-1], faces[1], bottom[1:-1][::-1]])
+            found.append(GlassSection(number, outline, (top, bottom)))
+    return found
+
+
+def drawn_surfaces(system: OpticalSystem, profiles: Sequence[Profile]) -> list[int]:
+    """Return the numbers of the surfaces that a section shows as curves.
+
+    They are mirrors, faces of glass, and all others that bend light, but not a stop in air.
+    """
+    glass = {
+        face for pair in system.neighbours if is_glass(system.materials[pair[0]]) for face in pair
+    }
+    return [
+        number
+        for number, profile in enumerate(profiles, 1)
+        if len(profile[0])
+        and (
+            number in system.mirrors
+            or number in glass
+            or (system.refracts(number) and number != system.stop)
+        )
+    ]
+
+
+def stop_bars(system: OpticalSystem, profile: Profile, length: float) -> list[np.ndarray]:
+    """Return the ends (2, 2), as z and y, mm, of bars outside of the stop, upper and lower.
+
+    They begin at the stop's edge and stand across its axis.
+
+    Args:
+        system: the lens.
+        profile: of the stop.
+        length: of a bar, mm.
+    """
+    z, y = profile
+    if not len(z):
+        return []
+    angle = axis_angle(system, system.stop)
+    bar = length * np.array([-math.sin(angle), math.cos(angle)])
+    rims = ((np.array([z[end], y[end]]), side) for end, side in ((-1, 1.0), (0, -1.0)))
+    return [np.stack([rim, rim + side * bar]) for rim, side in rims]
 
 
 def trace_fan(

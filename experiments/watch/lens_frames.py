@@ -17,13 +17,12 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.running.run_files import RESOLVED, read_settings
 from dolens.experiments.watch.history import Frame, History, Values
 from dolens.optics.lens import Lens
-from dolens.optics.materials import is_glass
 from dolens.optics.parameter_names import to_file_units
 from dolens.optimize import MeritSettings
 from dolens.optimize.rounds import spot_labels
-from dolens.plotting.layout import LayoutDrawing, layout_drawing
+from dolens.plotting.layout import layout_drawing
 from dolens.plotting.lens_section import section_angles
-from dolens.plotting.section import element_edges, sensor_curve
+from dolens.plotting.section import drawn_surfaces, glass_sections, sensor_curve, stop_bars
 from dolens.plotting.style import ordered_colours, spectral_colour
 from dolens.prescriptions import lens_from_prescription, load_lens
 
@@ -195,14 +194,19 @@ def section(lens: Lens, heights: Sequence[float]) -> dict[str, Any]:
     angles = section_angles(lens, heights, lens.primary_wavelength, distance)
     drawing = layout_drawing(lens, lens.primary_wavelength, angles, _RAYS, distance)
     colours = ordered_colours(len(heights))
-    glass, surfaces = _solids(drawing)
+    profiles = [(z[::_EVERY], y[::_EVERY]) for z, y in drawing.profiles]
+    system = drawing.system
+    bars = stop_bars(system, profiles[system.stop - 1], 0.2 * drawing.height)
     z, half = drawing.z_limits, drawing.half_height
     return {
         "box": [z[0], -half, z[1] - z[0], 2.0 * half],
-        "glass": glass,
-        "surfaces": surfaces,
-        "stop": _stop(drawing),
-        "sensor": _rounded(sensor_curve(drawing.system, drawing.sensor)),
+        "glass": [_rounded(glass.outline) for glass in glass_sections(system, profiles)],
+        "surfaces": [
+            _rounded(np.stack(profiles[number - 1], -1))
+            for number in drawn_surfaces(system, profiles)
+        ],
+        "stop": [_rounded(bar) for bar in bars],
+        "sensor": _rounded(sensor_curve(system, drawing.sensor)),
         "fields": [
             {
                 "label": f"{height:g}{'°' if distance is None else ' mm'}",
@@ -212,37 +216,6 @@ def section(lens: Lens, heights: Sequence[float]) -> dict[str, Any]:
             for height, colour, fan in zip(heights, colours, drawing.fans, strict=True)
         ],
     }
-
-
-def _solids(drawing: LayoutDrawing) -> tuple[list[Line], list[Line]]:
-    """Return outlines of all glass, and curves of all surfaces that bend light."""
-    system, profiles = drawing.system, drawing.profiles
-    glass, bounding = [], set()
-    for number, other in system.neighbours:
-        faces = profiles[number - 1], profiles[other - 1]
-        if not is_glass(system.materials[number]):
-            continue
-        bounding |= {number, other}
-        if len(faces[0][0]) and len(faces[1][0]):
-            top, bottom = element_edges(system, (number, other), *faces)
-            front, back = (np.stack(face, -1) for face in faces)
-            outline = [front[::_EVERY], top[1:-1], back[::-_EVERY], bottom[1:-1][::-1]]
-            glass.append(_rounded(np.concatenate(outline)))
-    return glass, [
-        _rounded(np.stack(profile, -1)[::_EVERY])
-        for number, profile in enumerate(profiles, 1)
-        if len(profile[0]) and (number in bounding or number in system.mirrors)
-    ]
-
-
-def _stop(drawing: LayoutDrawing) -> list[Line]:
-    """Return the bars outside of the stop."""
-    z, y = drawing.profiles[drawing.system.stop - 1]
-    if not len(z):
-        return []
-    length = 0.2 * drawing.height
-    ends = ((z[-1], y[-1], length), (z[0], y[0], -length))
-    return [_rounded(np.array([[a, b], [a, b + by]])) for a, b, by in ends]
 
 
 def form_section(prescription: Mapping[str, Any]) -> dict[str, Any] | str:
