@@ -44,7 +44,11 @@ ALONE = ("experiments", "report")
 FIRST_PAGE = ("dolens", "show", "cooke_triplet", "--html", "triplet.html")
 # Of a page's Python: sizes of an hour's work, and processes, which
 # tests/experiments/test_workers.py starts.
-SIZES = {"draw(100_000,": "draw(1_000,", "workers_of(2)": "workers_of(0)"}
+SIZES = {
+    "draw(100_000,": "draw(1_000,",
+    "workers_of(2)": "workers_of(0)",
+    "seconds=10)": "seconds=1)",
+}
 OTHERS = (
     ".venv/bin/pip",
     ".venv/bin/python",
