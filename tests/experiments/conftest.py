@@ -1,8 +1,11 @@
+import copy
 import logging
+import os
 import pickle
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -10,10 +13,6 @@ from unittest import mock
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_repository import ConfigRepository
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.core_plugins.importlib_resources_config_source import (
-    ImportlibResourcesConfigSource,
-)
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
@@ -22,12 +21,26 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
 from dolens.experiments import workers
+from dolens.experiments.data import package_photographs
+from dolens.experiments.data.photographs import read_photograph
 from dolens.experiments.experiment import Experiment
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_module, run
 from dolens.tasks import in_turn
 from tests.experiments.runs import Finished
 from tests.experiments.tiny_experiment import CAMERA, TRAINED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_files() -> Iterator[None]:
+    """No test cuts the power: nothing waits for a disk; and scikit-image's photographs, which do
+    not change, are decoded once for all runs.
+    """
+    with (
+        mock.patch.object(os, "fsync", lambda file: None),
+        mock.patch.object(package_photographs, "read_photograph", cache(read_photograph)),
+    ):
+        yield
 
 
 @pytest.fixture
@@ -43,17 +56,18 @@ load_config, parsed = ConfigRepository.load_config, {}
 def load_once(repository: ConfigRepository, config_path: str) -> ConfigResult | None:
     """Load a file of the configuration, which is parsed once for all tests.
 
-    Hydra itself keeps what it has parsed for one composition, and changes nothing in it.
+    As a copy: overrides are written into what Hydra has loaded.
     """
     source = repository._find_object_source(config_path, ObjectType.CONFIG)
-    if not isinstance(source, FileConfigSource | ImportlibResourcesConfigSource):
+    # By its name: Hydra loads its plugins, and so their classes, once more than `import` does.
+    if source is None or source.scheme() not in ("file", "pkg"):
         return load_config(repository, config_path)
     file = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
-    written = file.stat().st_mtime_ns if isinstance(source, FileConfigSource) else 0
+    written = file.stat().st_mtime_ns if source.scheme() == "file" else 0
     key = (file, written)
     if key not in parsed:
         parsed[key] = load_config(repository, config_path)
-    return parsed[key]
+    return copy.deepcopy(parsed[key])
 
 
 @contextmanager

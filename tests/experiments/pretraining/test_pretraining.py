@@ -9,11 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
+from dolens.experiments.pretraining import pretraining
 from dolens.experiments.pretraining.pretraining import Draws, Examples, dead_leaves, text
 from dolens.reconstruction.general import Stabiliser
 from dolens.sensor.colour import srgb_to_linear
 from tests.experiments.runs import same_to_the_bit
-from tests.experiments.tiny_experiment import ONE_EPOCH, TINY
+from tests.experiments.tiny_experiment import ONE_EPOCH, TINY, UNPICTURED, UNTESTED
 
 # Bright, quiet, with all colours in each pixel, and of one depth that is told.
 CLEAR = Draws(
@@ -155,10 +156,13 @@ def settings(folder):
     ]
 
 
-def test_a_resumed_training_is_the_same_to_the_bit(trained, tmp_path):
-    own = settings(tmp_path / "photographs")
+def test_a_resumed_training_is_the_same_to_the_bit(trained, tmp_path, monkeypatch):
+    # Of each kind one drawn picture, and small ones: a run draws them as it begins.
+    monkeypatch.setattr(pretraining, "_DRAWN", ((dead_leaves, 1), (text, 1)))
+    monkeypatch.setattr(pretraining, "_DRAWN_SIDE", 64)
+    own = [*settings(tmp_path / "photographs"), UNPICTURED]
     whole = trained(*own, folder="whole")
-    begun = trained(*own, ONE_EPOCH, folder="begun")
+    begun = trained(*own, *UNTESTED, ONE_EPOCH, folder="begun")
     again = trained(*own, f"ckpt_path={begun.last}")
     assert again.objective == whole.objective
     first, second = whole.checkpoint(), again.checkpoint()
