@@ -9,7 +9,10 @@ from dolens.optimize import merit
 from tests.experiments.camera.test_field_views import doublet
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET, UNTESTED
 
-DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=1"]
+DLS = [
+    "optimizer.lens=dls",
+    *(f"optimizer.least_squares.{setting}" for setting in ("every=1", "first_iterations=0")),
+]
 TRAINED = [*TINY_DOUBLET, *FIXED_WINDOWS, *UNTESTED]
 
 

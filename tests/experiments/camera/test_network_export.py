@@ -99,12 +99,11 @@ def test_deconvolution_by_matrices_is_that_by_fourier_transforms(blur):
         assert (found.real_module(raw) - found.module(raw)).abs().max() < 1e-11
 
 
-@pytest.mark.parametrize("kind", ["depths", "features", "nafnet", "general"])
+@pytest.mark.parametrize("kind", ["features", "nafnet", "general"])
 def test_filters_that_mix_colours_are_exported_with_the_lens_built_in(kind, blur, tmp_path):
     nafnet = {"width": 2, "down": (1,), "up": (1,)}
     network = {
-        "depths": lambda: FeatureWienerRestoration(width=2, depth=1, margin=4, depths=2),
-        "features": lambda: FeatureWienerRestoration(2, 1, margin=4, features=2, scales=2),
+        "features": lambda: FeatureWienerRestoration(2, 1, 4, depths=2, features=2, scales=2),
         "nafnet": lambda: WienerNAFNetRestoration(**nafnet, margin=4),
         "general": lambda: GeneralRestoration("none", width=4, down=(1,), middle=1, up=(1,)),
     }[kind]()
@@ -121,7 +120,6 @@ def test_filters_that_mix_colours_are_exported_with_the_lens_built_in(kind, blur
 def test_a_nafnet_takes_multiples_of_its_groups_and_halvings(tmp_path):
     found = exportable(camera_of(NAFNetRestoration(2, (1,), 1, (1,))))
     assert found.multiple == 4 and found.size == (24, 20)
-    assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
     assert export_onnx(found, tmp_path / "network.onnx").facts["largest_error"] < 1e-5
 
 
