@@ -14,7 +14,7 @@ from dolens.experiments.commands.apply_options import Options
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.display import write_picture
 from tests.experiments.conftest import finished_run
-from tests.experiments.tiny_experiment import ONE_EPOCH, TINY
+from tests.experiments.tiny_experiment import ONE_EPOCH, TINY, UNPICTURED
 from tests.reconstruction.test_readouts import textured
 
 SIDE, SIZE = 32, 33
@@ -202,7 +202,7 @@ def test_a_bracket_trains_and_is_judged_beside_untrained_restorers(trained):
 
 def test_a_bracket_is_applied_to_whole_pictures_at_rest(root, tmp_path):
     """Its sensor's picture is the mean of the readouts, and what is restored is of all of them."""
-    untrained = ("network=wiener_tv", "train=false", "light=1000")
+    untrained = ("network=wiener_tv", "train=false", "light=1000", UNPICTURED)
     folder = finished_run(root, tmp_path, *BRACKET, *untrained)
     picture = tmp_path / "scene.png"
     write_picture(picture, linear_to_srgb(texture()[0].float().repeat(1, 2, 2)), 16)

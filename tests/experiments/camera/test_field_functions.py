@@ -24,7 +24,7 @@ from dolens.sensor.readout import Readout
 from tests.experiments.camera.test_field_views import LINES, WHOLE, doublet
 from tests.experiments.conftest import finished_run
 from tests.experiments.runs import Finished
-from tests.experiments.tiny_experiment import TINY_DOUBLET
+from tests.experiments.tiny_experiment import ONE_EPOCH, TINY_DOUBLET, UNPICTURED
 
 ZONE = {"0.5": 0.5}
 # Blur of some four pixels, whole in its window; test images as sharp in noise as functions are.
@@ -248,7 +248,7 @@ def field_run(root, tmp_path_factory):
         root,
         tmp_path_factory.mktemp("field"),
         *GENERAL,
-        "trainer.max_epochs=1",
+        *(ONE_EPOCH, UNPICTURED),
         "learning_rates.optics=0.1",
     )
 
