@@ -303,16 +303,19 @@ def _write(
 ) -> None:
     """Write two lines above a section: title and words, and what is not kept."""
     title = figure.text(left, top, form.title, fontsize=SMALL + 1, fontweight="bold", va="top")
-    begin = title.get_window_extent().width / figure.bbox.width
-    figure.text(left + begin + 0.012, top, form.words, fontsize=SMALL, va="top", color="0.25")
+    begin = title.get_window_extent().width / figure.bbox.width + 0.012
+    words = figure.text(left + begin, top, form.words, fontsize=SMALL, va="top", color="0.25")
+    taken = words.get_window_extent().width / figure.bbox.width
+    if taken > width - begin:
+        words.set_fontsize(SMALL * (width - begin) / taken)
     if not form.problem:
         return
     y = top - _LINE / whole
     text = figure.text(left, y, form.problem, fontsize=SMALL - 1, va="top", color=PALETTE[1])
-    words = form.problem.split(" ")
-    while len(words) > 1 and text.get_window_extent().width > width * figure.bbox.width:
-        words.pop()
-        text.set_text(f"{' '.join(words).rstrip(',')} …")
+    parts = form.problem.split(" ")
+    while len(parts) > 1 and text.get_window_extent().width > width * figure.bbox.width:
+        parts.pop()
+        text.set_text(f"{' '.join(parts).rstrip(',')} …")
 
 
 def _scale(figure: Figure, inches_a_mm: float, cell: float, whole: float) -> None:
