@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import jvp, vmap
 
 # Directions of forward mode that are carried together.
-_TOGETHER = 8
+_TOGETHER = 16
 
 
 def is_transformed() -> bool:
@@ -89,7 +89,7 @@ def forward_columns(
 ) -> tuple[Tensor, Tensor]:
     """A function's value and its derivatives, by forward mode, for some variables at a time.
 
-    Memory is that of the columns and of eight sweeps, however long the computation.  Derivatives
+    Memory is that of the columns and of sixteen sweeps, however long the computation.  Derivatives
     that are carried together share the values: a third of the time of one after the other where
     tensors are small, and three quarters where they are large.
 

@@ -49,17 +49,20 @@ def test_a_camera_far_out_of_focus_is_found(made):
     """The 28th camera of seed 0: from weights of where its centroids put it, sums of the first pass
     lead ten deviations of the prior away, where rays miss the lens.
     """
-    module = made("experiment=chart_photographs", "planes=[2.3,2.6,2.9]", "seed=0")
+    corners = ["chart.rows=2", "chart.columns=3", "chart.pitch=190", "subsets=[1]"]
+    fine = ["pixel_pitch=0.0069", "module.pupil.rings=6", "module.pupil.arms=16", "photons=20000"]
+    planes = "planes=[2.3,2.6,2.9]"
+    module = made("experiment=chart_photographs", planes, "seed=0", *corners, *fine)
     model, prior = module.model, module.prior
     others = module.tolerances, module.unmodelled, module.seed
     specimen = drawn(module.lens, model, prior, *others, 28)
     seen = simulated(model, prior, specimen, module.light, module.windows.search_radius)
     coarse = replace(model, rays=replace(model.rays, rings=4, arms=12))
     with one_thread():
-        fit = fit_chart([coarse, coarse, model], seen, prior)
+        fit = fit_chart([coarse, model], seen, prior)
     assert fit.converged
-    # χ² is known to √(2·1339) = 52; and the largest of thirty errors is below four.
-    assert fit.chi_squared == pytest.approx(fit.degrees_of_freedom, abs=4 * 52)
+    # χ² is known to √(2·209) = 20; and the largest of thirty errors is below four.
+    assert fit.chi_squared == pytest.approx(fit.degrees_of_freedom, abs=4 * 20)
     errors = (fit.numbers - specimen.truth) / fit.standard_errors
     assert float(errors.abs().max()) < 4.0
 

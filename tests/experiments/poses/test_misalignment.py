@@ -126,22 +126,27 @@ def test_three_planes_tell_bench_and_lens_at_once(trained, blur, finds):
     Weighted by the noise of the model's own light, dark pixels keep it where it is; by that of the
     light within four pixels it finds its way.
     """
-    own = f"{{optimizer: dls, iterations: 8, loss: noise_weighted, noise_blur: {blur}}}"
+    # What is lost has hardly moved, and needs no more of them.
+    side, first = (32, 8) if finds else (64, 5)
+    own = f"{{optimizer: dls, iterations: {first}, loss: noise_weighted, noise_blur: {blur}}}"
     last = (
-        "{optimizer: dls, iterations: 3, loss: noise_weighted, damping: 1.0e-6,"
-        f" noise_blur: {min(blur, 1.0)}}}"
+        ", {optimizer: dls, iterations: 3, loss: noise_weighted, damping: 1.0e-6, noise_blur: 1.0}"
+        if finds
+        else ""
     )
     found = trained(
         "experiment=misalignment_planes",
-        *("sensor.height=64", "sensor.width=64", "sensor.pixel_pitch=0.1104"),
-        *("imager.rays=20000", "monte_carlo=0", f"stages=[{own},{last}]", QUIET),
+        *(f"sensor.height={side}", f"sensor.width={side}", f"sensor.pixel_pitch={7.0656 / side}"),
+        *(f"imager.rays={250 * side}", "monte_carlo=0", f"stages=[{own}{last}]", QUIET),
+        "callbacks.pictures.dpi=60" if finds else UNPICTURED,
     )
     rows = found.table("poses")
     assert len(rows) == 8
     ratios = [abs(float(row["error"])) / float(row["bound"]) for row in rows]
     assert (max(ratios) < 6.0) if finds else (max(ratios) > 100.0)
     assert all(float(row["bound"]) == float(row["own_bound"]) for row in rows)
-    assert found.figures == {"spots", "convergence_10", "corner_10"}
+    if finds:
+        assert found.figures == {"spots", "convergence_10", "corner_10"}
 
 
 def test_patches_of_light_are_as_narrow_as_rays_are_dense():
