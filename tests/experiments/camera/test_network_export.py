@@ -120,6 +120,7 @@ def test_filters_that_mix_colours_are_exported_with_the_lens_built_in(kind, blur
 def test_a_nafnet_takes_multiples_of_its_groups_and_halvings(tmp_path):
     found = exportable(camera_of(NAFNetRestoration(2, (1,), 1, (1,))))
     assert found.multiple == 4 and found.size == (24, 20)
+    assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
     assert export_onnx(found, tmp_path / "network.onnx").facts["largest_error"] < 1e-5
 
 
@@ -129,6 +130,7 @@ def test_a_feature_pyramid_takes_multiples_of_its_backbone_s_stride(tmp_path):
     )
     found = exportable(camera_of(network))
     assert found.multiple == 4 and found.size == (24, 20)
+    assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
     assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
 
 
