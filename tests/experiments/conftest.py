@@ -86,7 +86,8 @@ def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
             cfg.hydra.runtime.output_dir = str(output)
             cfg.hydra.job.num = 0
             pictures = (cfg.get("callbacks") or {}).get("pictures")
-            if pictures and not any("pictures" in override for override in overrides):
+            own = any("pictures" in override for override in overrides)
+            if isinstance(pictures, DictConfig) and not own:
                 pictures.dpi = 80  # as many pixels as loggers get: seldom does a test look at them
         HydraConfig.instance().set_config(cfg)
         return cfg
