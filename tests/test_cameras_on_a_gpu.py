@@ -10,6 +10,7 @@ from dolens.optics import ray_tracing
 from dolens.reconstruction.general import GeneralRestoration
 from dolens.reconstruction.untrained import WienerTVRestoration
 from dolens.reconstruction.whole_pictures import restore
+from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -84,6 +85,11 @@ def test_images_and_gradients_are_there_and_those_of_the_cpu(name, pretended):
         assert torch.equal(expected, found)
 
 
+def test_a_renderer_is_planned_there(lens):
+    plan = AutoRenderer(SENSOR, 4.0).make_plan(lens, PlanarScene((8000.0,), LINES[1:2]))
+    assert plan.renderer.sensor == SENSOR
+
+
 @there
 def test_a_field_is_seen_and_read_out_there():
     lens = load_lens("large_fov_doublet", dtype=torch.float32).to("cuda")
@@ -120,7 +126,7 @@ def test_restorers_of_any_lens_are_told_the_noise(kind):
     assert restored.device.type == "cuda"
 
 
-def test_a_photograph_is_planned_taken_and_restored_there(lens):
+def test_a_photograph_is_taken_and_restored_there(lens):
     photo = lens.photograph(torch.rand(3, 32, 48), light=1000)
     restored = restore(photo)
     assert photo.image.device.type == restored.image.device.type == "cuda"

@@ -42,7 +42,7 @@ PLACEHOLDER = re.compile(r"\.\.\.|…|\b(?:NAME|LENS|FOLDER|A B)\b(?!/)|\[key=")
 ALONE = ("experiments", "report")
 # Pages take seconds: one is written, and of the others the arguments are tried.
 FIRST_PAGE = ("dolens", "show", "cooke_triplet", "--html", "triplet.html")
-# Of a page's Python: sizes of an hour's work, and processes, which
+# Of a page's Python: sizes of long work, and processes, which
 # tests/experiments/test_workers.py starts.
 SIZES = {
     "draw(100_000,": "draw(1_000,",

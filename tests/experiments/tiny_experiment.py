@@ -48,3 +48,9 @@ TINY_DOUBLET = [
     "network.weights=none",
 ]
 FIXED_WINDOWS = ["renderer.fields=[1,1]"]
+# The lens takes turns with the network, and is not designed first.
+IN_TURNS = [
+    "optimizer.lens=dls",
+    "optimizer.least_squares.every=2",
+    "optimizer.least_squares.first_iterations=0",
+]

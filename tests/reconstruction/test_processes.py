@@ -56,10 +56,10 @@ def judged(real, fake):
     return [*(p.grad for p in judges.parameters()), *numbers.values()], fake.grad
 
 
-def work(rank, store):
-    """What one of two processes finds, as lists."""
-    distributed.init_process_group("gloo", f"file://{store}", rank=rank, world_size=2)
+def work(rank, store, results):
+    torch.set_num_threads(1)
     try:
+        distributed.init_process_group("gloo", f"file://{store}", rank=rank, world_size=2)
         own = slice(2 * rank, 2 * rank + 2)
         layers = share_batch_statistics(network())
         found = step(layers, images()[own])
@@ -72,31 +72,25 @@ def work(rank, store):
         numbers = gathered({"rank": rank})
         # Lists: a tensor's memory would go with its process.
         plain = {name: value.tolist() for name, value in found.items()}
-        return rank, plain, [g.tolist() for g in judges], restored.tolist(), numbers
-    finally:
-        distributed.destroy_process_group()
-
-
-def beside(store, results):
-    torch.set_num_threads(1)
-    try:
-        results.put(work(1, store))
+        results.put((rank, plain, [g.tolist() for g in judges], restored.tolist(), numbers))
     except Exception:
-        results.put((1, traceback.format_exc(), None, None, None))
+        results.put((rank, traceback.format_exc(), None, None, None))
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """What each of two processes has found, of which this one is the first."""
+    """What each of two processes has found."""
     store = tmp_path_factory.mktemp("store") / "file"
     context = multiprocessing.get_context("spawn")
     results = context.Queue()
-    other = context.Process(target=beside, args=(store, results))
-    other.start()
-    own = work(0, store)
-    found = own, results.get(timeout=300)
-    other.join()
-    assert isinstance(found[1][1], dict), found[1][1]
+    started = [context.Process(target=work, args=(rank, store, results)) for rank in range(2)]
+    for process in started:
+        process.start()
+    found = sorted([results.get(timeout=300) for _ in started], key=lambda entry: entry[0])
+    for process in started:
+        process.join()
+    for _, values, *_ in found:
+        assert isinstance(values, dict), values
     return found
 
 

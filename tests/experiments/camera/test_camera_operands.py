@@ -7,12 +7,9 @@ from dolens.experiments.camera.lens_merit import CameraOperands
 from dolens.optics.aiming import aim
 from dolens.optimize import merit
 from tests.experiments.camera.test_field_views import doublet
-from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET, UNTESTED
+from tests.experiments.tiny_experiment import FIXED_WINDOWS, IN_TURNS, TINY_DOUBLET, UNTESTED
 
-DLS = [
-    "optimizer.lens=dls",
-    *(f"optimizer.least_squares.{setting}" for setting in ("every=1", "first_iterations=0")),
-]
+DLS = [*IN_TURNS, "optimizer.least_squares.every=1"]
 TRAINED = [*TINY_DOUBLET, *FIXED_WINDOWS, *UNTESTED]
 
 

@@ -16,17 +16,13 @@ from dolens.reconstruction.wiener import linear_error, natural_spectrum
 from tests.experiments.tiny_experiment import (
     CAMERA,
     FIXED_WINDOWS,
+    IN_TURNS,
     ONE_EPOCH,
     TINY_DOUBLET,
     UNPICTURED,
     UNTESTED,
 )
 
-# In turns with the network alone: the lens is not designed first.
-DLS = [
-    "optimizer.lens=dls",
-    *(f"optimizer.least_squares.{setting}" for setting in ("every=2", "first_iterations=0")),
-]
 DOUBLET = [*TINY_DOUBLET, *FIXED_WINDOWS, UNPICTURED]
 
 
@@ -72,7 +68,7 @@ def test_rays_move_farther_while_the_slope_is_kept_and_less_far_where_it_turns()
 
 def test_the_plate_moves_in_turns_and_within_its_bounds(trained):
     """Six steps of the network, three of the lens."""
-    metrics = trained(*CAMERA, *DLS, "data.steps_per_epoch=6", ONE_EPOCH, *UNTESTED).metrics
+    metrics = trained(*CAMERA, *IN_TURNS, "data.steps_per_epoch=6", ONE_EPOCH, *UNTESTED).metrics
     assert metrics["lens_steps/taken"] == 3.0
     assert metrics["variables/surfaces.5.x3"] != pytest.approx(1.5e-5, rel=1e-4)
     for name in ("x3", "x2y", "xy2", "y3"):
@@ -81,7 +77,7 @@ def test_the_plate_moves_in_turns_and_within_its_bounds(trained):
 
 def test_a_doublet_holds_its_focal_length(trained):
     """The solve holds it through the steps of least squares too."""
-    found = trained(*DOUBLET, *DLS)
+    found = trained(*DOUBLET, *IN_TURNS)
     assert found.metrics["lens_steps/taken"] == 2.0
     efl = float(found.lens().first_order().efl.detach())
     assert efl == pytest.approx(67.57969, rel=1e-5)
