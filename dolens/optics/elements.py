@@ -57,12 +57,27 @@ class Element(nn.Module):
 
 @dataclass(frozen=True)
 class ElementState:
-    """An element as pure functions see it; see `Element`."""
+    """An element as pure functions see it; see `Element`.
+
+    Attributes:
+        first: number of its first surface.
+        last: number of its last surface.
+        parameters: of its pose.
+        pivot: mm, from the vertex, as designed, of the surface `origin`.
+        origin: number of a surface; None: the first.  Light that comes back to an element meets
+            other surfaces of it first.
+    """
 
     first: int
     last: int
     parameters: Mapping[str, Tensor]
     pivot: tuple[float, float, float]
+    origin: int | None = None
+
+    @property
+    def place(self) -> int:
+        """Return the place, from 0, of the surface whose vertex the pivot counts from."""
+        return (self.first if self.origin is None else self.origin) - 1
 
 
 class Axes(NamedTuple):
@@ -259,7 +274,7 @@ def from_lens_axes(ray: Components, axes: Axes) -> Components:
 def _motion(element: ElementState, vertices: Sequence[Tensor]) -> Motion:
     """Rotation, pivot and displacement of one element."""
     p = element.parameters
-    z = vertices[element.first - 1]
+    z = vertices[element.place]
     zero = torch.zeros_like(z)
     # Added as a tensor: a Python number makes a scalar double under torch.func's forward mode.
     pivot = torch.stack([zero, zero, z]) + z.new_tensor(element.pivot)

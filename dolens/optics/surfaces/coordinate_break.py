@@ -143,7 +143,7 @@ def broken_axes(
         vertices: z along the axis as if nothing broke it, mm; the last of the sensor.
     """
     designed = _designed(surfaces, gaps)
-    motions = [_motion(element, designed[element.first - 1]) for element in elements]
+    motions = [_motion(element, designed[element.place]) for element in elements]
     spans = [(element.first, element.last) for element in elements]
     found, segment = [], 0
     for number, (origin, rotation) in enumerate(designed, 1):

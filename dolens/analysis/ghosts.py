@@ -1,0 +1,469 @@
+"""Ghosts of a source: light that is reflected twice, path by path, where it lands and how bright.
+
+Rays from one object point fill the front surface, not the stop alone: a ghost may leave through
+other parts of the lens than the image.  Of every path there are
+
+- what real rays tell: its power at the sensor, where it lands, its size and irradiance;
+- what first-order optics tells of the unfolded path, as OpticStudio's ghost focus generator lists
+  it: where it is focused, the height of the marginal ray at the sensor, the focal length, and the
+  image of the stop.
+
+The irradiance on the sensor over that of the source's light in front of the lens is the point
+source transmittance of stray light analysis (Fest, Stray Light Analysis and Control, SPIE, 2013).
+The power of a ghost over that of the image is also the share of veiling light that it adds where
+all of the field is as bright.
+
+A surface reflects what bare glass does at normal incidence, R = ((n' - n)/(n' + n))², and passes
+the rest.  A source lit by no image has no power over it (NaN).
+
+Where rays begin is a lattice, the same in each run.  It is made of blocks, each of which covers the
+front alone; errors are standard errors by leaving out one block after the other (jackknife).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.conditions import Conditions
+from dolens.errors import InputError, check_count
+from dolens.optics.aiming import field_line, launch
+from dolens.optics.field_and_aperture import in_double_precision
+from dolens.optics.ghost_paths import (
+    Path,
+    check_path,
+    ghost_path_systems,
+    ghost_paths,
+    unfolded,
+)
+from dolens.optics.image_surface import WITHOUT_EDGE
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import behind_surfaces, curvatures_of, first_order, powers_of, vergence
+from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.rays import Rays, Status
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optics.system import OpticalSystem
+
+# Blocks of rays, whose scatter tells the error.
+_BLOCKS = 8
+# The plastic number's inverse powers: steps of a lattice that covers a square evenly (Roberts,
+# 2018), whatever the number of points.
+_STEPS = (0.7548776662466927, 0.5698402909980532)
+# Rings and azimuths of the front surface whose light is looked for, and room about them.
+_RINGS, _AZIMUTHS, _ROOM = 8, 72, 1.01
+# First zero of Bessel's J₁ over 2π.
+_AIRY = 0.6098349456332723
+
+
+class GhostMeasures(NamedTuple):
+    """P paths are measured by real rays, each number (P,); NaN where no light arrives.
+
+    Attributes:
+        share: power at the sensor over that of the light that enters the front surface.
+        power: power at the sensor over that of the image.
+        irradiance: mean on the ghost over that of the light in front of the lens, across the light.
+        x: mm, centroid on the sensor.
+        y: mm.
+        rms: mm, RMS distance from the centroid.
+    """
+
+    share: Tensor
+    power: Tensor
+    irradiance: Tensor
+    x: Tensor
+    y: Tensor
+    rms: Tensor
+
+
+class GhostFirstOrder(NamedTuple):
+    """First-order optics of P unfolded paths, each number (P,), mm; infinite where there is none.
+
+    Attributes:
+        focus: from the sensor to where an axial beam is focused; negative in front of it.
+        efl: effective focal length of the path.
+        marginal: height at the sensor of the marginal ray of the lens's axial beam.
+        pupil: from the sensor to the image of the stop, as its first pass is seen from behind.
+        slope: of the marginal ray at the sensor.
+    """
+
+    focus: Tensor
+    efl: Tensor
+    marginal: Tensor
+    pupil: Tensor
+    slope: Tensor
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """The ghosts of one object point, in the order of their irradiance, the brightest first.
+
+    Attributes:
+        where: its field, wavelengths and object distance.
+        paths: P paths, each as the surfaces that reflect, in the order of the light.
+        measures: by real rays.
+        errors: standard errors of these.
+        first_order: by first-order optics, at the reference wavelength.
+        image: share of the light that enters the front surface that arrives in the image.
+        image_error: its standard error.
+        rays: of each path and wavelength that enter the front surface.
+        sensor: number of the sensor among the surfaces, one more than the last.
+    """
+
+    where: Conditions
+    paths: tuple[Path, ...]
+    measures: GhostMeasures
+    errors: GhostMeasures
+    first_order: GhostFirstOrder
+    image: float
+    image_error: float
+    rays: int
+    sensor: int
+
+    @property
+    def total(self) -> float:
+        """Return the power of all ghosts over that of the image."""
+        return float(self.measures.power.nansum()) if self.image > 0.0 else math.nan
+
+
+@dataclass(frozen=True)
+class FrontRays:
+    """Rays of one object point and wavelength that enter the front surface.
+
+    Attributes:
+        rays: (N,).
+        weight: (N,), of a ray: the area (mm²) that it stands for where the light is as strong as at
+            the first vertex.
+        block: (N,), int64, from 0.
+        ends: (N,), int64: twice the number of the surface where the ray ends on the image's path,
+            and one more where it is reflected totally; more than any where it arrives.
+        image: (N,), bool: it arrives in the image.
+        landed: (N, 2), mm, where.
+    """
+
+    rays: Rays
+    weight: Tensor
+    block: Tensor
+    ends: Tensor
+    image: Tensor
+    landed: Tensor
+
+    def of(self, path: Path) -> tuple[Rays, Tensor, Tensor]:
+        """Return the rays that come to the surface that reflects first, with weights and blocks."""
+        # They come first; see `front_rays`.
+        count = int((self.ends > 2 * path[0]).sum())
+        rays = Rays(self.rays.position[:count], self.rays.direction[:count], self.rays.wavelength)
+        return rays, self.weight[:count], self.block[:count]
+
+
+@torch.no_grad()
+def ghosts(
+    lens: Lens,
+    where: Conditions,
+    rays: int = 10_000,
+    bounces: int = 2,
+    sensor_reflectance: float = 0.0,
+    paths: Sequence[Sequence[int]] | None = None,
+) -> Ghosts:
+    """Find the ghosts of an object point.
+
+    Args:
+        lens: the lens; where it names the diameter of its sensor, light beside that is not counted.
+        where: one field, inside of the lens's own or not; wavelengths, and object distance.
+        rays: of each path and wavelength, before the front surface takes some.
+        bounces: reflections of a path, 2, 4 or 6.
+        sensor_reflectance: share of the light that the sensor reflects, as a mirror; at zero it
+            makes no ghosts.
+        paths: those to look at, as `[(5, 3), (6, 5)]`; None: all.
+
+    Raises:
+        InputError: more or fewer than one field, a number out of range, or a path that there is
+            not.
+    """
+    check_count("rays", rays)
+    if len(where.fields) != 1:
+        raise InputError(f"ghosts are those of one field, not of {len(where.fields)}")
+    if not 0.0 <= sensor_reflectance <= 1.0:
+        raise InputError(f"sensor_reflectance: {sensor_reflectance}; allowed: 0 to 1")
+    lens = in_double_precision(lens)
+    system = lens.system()
+    reflects = sensor_reflectance > 0.0
+    if paths is None:
+        chosen = ghost_paths(system, bounces, reflects)
+    else:
+        chosen = [check_path(system, path, reflects) for path in paths]
+    if not chosen:
+        raise InputError(f"lens '{lens.name}': no two surfaces reflect light, and no ghosts are")
+    radius = 0.5 * lens.sensor_diameter if lens.sensor_diameter else math.inf
+    sums = torch.zeros(len(chosen) + 1, _BLOCKS, 6, dtype=torch.float64)
+    entering = torch.zeros(_BLOCKS, dtype=torch.float64)
+    count = 0
+    for wave, share in zip(where.wavelengths.tolist(), where.weights.tolist(), strict=True):
+        front = front_rays(lens, where, wave, rays)
+        count = max(count, len(front.weight))
+        entering += share * _by_block(front.block, front.weight[:, None])[:, 0]
+        passing = PassedShares(system, wave, sensor_reflectance)
+        light = share * passing.of(()) * front.weight * front.image
+        sums[-1] += _sums(front.landed, light, front.block, radius)
+        catching = sensor_aperture(lens)
+        for number, ghost in enumerate(ghost_path_systems(system, chosen, catching)):
+            beam, weight, block = front.of(chosen[number])
+            if len(weight):
+                hit = trace_rays(ghost, beam)
+                light = share * passing.of(chosen[number]) * (weight * hit.valid)
+                sums[number] += _sums(hit.position[:, :2], light, block, radius)
+    first = ghosts_first_order(system, chosen, where.reference_wavelength, where.object_distance)
+    longest = float(where.wavelengths.max()) * 1e-6
+    smallest = math.pi * (_AIRY * longest / first.slope.abs()).square()
+    found, errors, image = _with_errors(sums, entering, smallest, count)
+    order = found.irradiance.nan_to_num(-1.0).argsort(descending=True, stable=True)
+    return Ghosts(
+        where,
+        tuple(chosen[number] for number in order.tolist()),
+        GhostMeasures(*(values[order] for values in found)),
+        GhostMeasures(*(values[order] for values in errors)),
+        GhostFirstOrder(*(values[order] for values in first)),
+        *image,
+        count,
+        len(system.surfaces) + 1,
+    )
+
+
+def sensor_aperture(lens: Lens) -> ClearAperture:
+    """Return what a sensor catches: a circle where the lens names its diameter."""
+    diameter = lens.sensor_diameter
+    return ClearAperture(Circle(0.5 * diameter)) if diameter else WITHOUT_EDGE
+
+
+class PassedShares:
+    """Gives the share of light that passes along a path, by bare glass at normal incidence.
+
+    Args:
+        system: the lens.
+        wavelength: nm.
+        sensor_reflectance: share that the sensor reflects.
+    """
+
+    def __init__(
+        self, system: OpticalSystem, wavelength: float, sensor_reflectance: float = 0.0
+    ) -> None:
+        indices = [float(index) for index in system.indices(wavelength)]
+        self.reflected = [((one - other) / (one + other)) ** 2 for one, other in pairwise(indices)]
+        self.reflected.append(sensor_reflectance)
+
+    def of(self, path: Path) -> float:
+        """Return the share of a path; () is that of the image."""
+        way, found = unfolded(path, len(self.reflected) - 1), 1.0
+        for place, number in enumerate(way.numbers):
+            share = self.reflected[number - 1]
+            found *= share if place in way.bounces else 1.0 - share
+        return found
+
+
+def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> FrontRays:
+    """Launch rays of an object point that fill the front surface.
+
+    They come in the order of how far they get on the image's path, so that those that reach a
+    surface are the first so many.
+
+    Args:
+        lens: in double precision.
+        where: the field is its first; and object distance.
+        wavelength: nm.
+        count: of rays, before the front surface takes some.
+    """
+    system = lens.system()
+    field = where.fields[0].to(lens.device)
+    infinite = where.object_distance is None
+    line, near = field_line(torch.deg2rad(field) if infinite else field, where.object_distance)
+    low, high = front_box(system, line, float(near))
+    k = torch.arange(count, dtype=torch.float64, device=lens.device)[:, None]
+    lattice = (0.5 + k * torch.tensor(_STEPS).to(k)).frac()
+    q = low + lattice * (high - low)
+    ray = launch(line, near, q)
+    rays = Rays.from_components(ray, wavelength)
+    # From a near point, light falls off with the square of the distance and obliquely.
+    slope = line[2] * near * q.norm(dim=-1)
+    weight = float((high - low).prod()) / count * (1.0 + slope * slope) ** -1.5
+    block = (k[:, 0] * (_BLOCKS / count)).long().clamp(max=_BLOCKS - 1)
+    first = system.met[0]
+    enters = trace_rays(system, rays, 1.0, False, 1, first).valid
+    hit = trace_rays(system, rays)
+    beyond = 2 * (len(system.surfaces) + 2)
+    ends = torch.where(hit.valid, beyond, 2 * hit.surface.long() + (hit.status == Status.TIR))
+    kept = torch.nonzero(enters)[:, 0]
+    kept = kept[ends[kept].argsort(descending=True, stable=True)]
+    return FrontRays(
+        Rays(rays.position[kept], rays.direction[kept], wavelength),
+        weight[kept],
+        block[kept],
+        ends[kept],
+        hit.valid[kept],
+        hit.position[kept][:, :2],
+    )
+
+
+def front_box(system: OpticalSystem, line: Tensor, near: float) -> tuple[Tensor, Tensor]:
+    """Return the corners (2,) of the smallest box, in the plane that faces an object point, whose
+    rays cover the clear aperture of the first surface; see `dolens.optics.aiming.launch`.
+
+    Args:
+        system: the lens.
+        line: (3,), unit vector from the object point to the first vertex.
+        near: one over the object's distance, 1/mm.
+    """
+    number = system.met[0]
+    surface = system.surfaces[number - 1]
+    radius = surface.semi_diameter * torch.arange(1, _RINGS + 1, dtype=torch.float64) / _RINGS
+    angle = torch.arange(_AZIMUTHS, dtype=torch.float64) * (2.0 * math.pi / _AZIMUTHS)
+    x, y = (radius[:, None] * f(angle) for f in (torch.cos, torch.sin))
+    sag = surface.sag_and_slopes(x.flatten(), y.flatten())[0]
+    rotation, origin = system.place(number)
+    points = torch.stack((x.flatten(), y.flatten(), sag), -1) @ rotation.mT + origin
+    l, m, n = (float(c) for c in line)  # noqa: E741
+    axes = points.new_tensor(
+        [
+            [1.0 - l * l / (1.0 + n), -l * m / (1.0 + n), -l],
+            [-l * m / (1.0 + n), 1.0 - m * m / (1.0 + n), -m],
+        ]
+    )
+    q, along = points @ axes.mT, points @ points.new_tensor([l, m, n])
+    q = q / (1.0 + n * near * along).clamp(min=1e-6)[:, None]
+    low, high = q.amin(0), q.amax(0)
+    middle, half = 0.5 * (low + high), 0.5 * _ROOM * (high - low)
+    return (middle - half).to(line), (middle + half).to(line)
+
+
+def ghosts_first_order(
+    system: OpticalSystem,
+    paths: Sequence[Path],
+    wavelength: float,
+    object_distance: float | None = None,
+) -> GhostFirstOrder:
+    """Return first-order optics of unfolded paths, without gradients.
+
+    `dolens.optics.paraxial.first_order` of a path's system gives the same with gradients.
+
+    Args:
+        system: the lens.
+        paths: as `ghost_paths` gives them.
+        wavelength: nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+    """
+    # Python's numbers take a hundredth of the time of tensors.
+    curvatures, gaps, indices = (
+        [float(value) for value in values]
+        for values in (
+            [*curvatures_of(system), 0.0 if system.image is None else _curvature(system)],
+            [*system.thicknesses, system.sensor_distance],
+            system.indices(wavelength),
+        )
+    )
+    powers = powers_of(system, wavelength)
+    added = [0.0] * len(curvatures) if powers is None else [*map(float, powers), 0.0]
+    first = first_order(system, wavelength, object_distance)
+    near = indices[0] * float(vergence(object_distance))
+    pupil = first.entrance_pupil
+    height = 0.5 * float(pupil.diameter)
+    if near:
+        # From the axial object point to the rim of the pupil.
+        height /= 1.0 + float(pupil.z) * float(vergence(object_distance))
+    rows = []
+    negative = [-gap for gap in gaps]
+    for path, ghost in zip(paths, ghost_path_systems(system, paths), strict=True):
+        way = unfolded(path, len(system.surfaces))
+        n = [s * indices[medium] for s, medium in zip(ghost.senses, way.media, strict=True)]
+        c = [curvatures[number - 1] for number in way.numbers]
+        t = way.between(gaps, negative)
+        # A surface that reflects does not deflect by its law.
+        p = [0.0 if i in way.bounces else added[m - 1] for i, m in enumerate(way.numbers)]
+        a, b, low, d = behind_surfaces(c, t, n, p)
+        behind, distance = n[-1], gaps[-1]
+        y, nu = height * (a + b * near), height * (low + d * near)
+        stop = ghost.stop - 1
+        _, b_stop, _, d_stop = behind_surfaces(c[stop:], t[stop:], n[stop:], p[stop:])
+        rows.append(
+            (
+                math.inf if nu == 0.0 else -behind * y / nu - distance,
+                math.inf if low == 0.0 else -1.0 / low,
+                y + nu / behind * distance,
+                math.inf if d_stop == 0.0 else -behind * b_stop / d_stop - distance,
+                nu / behind,
+            )
+        )
+    found = torch.tensor(rows, dtype=torch.float64)
+    return GhostFirstOrder(*found.unbind(-1))
+
+
+def _curvature(system: OpticalSystem) -> Any:
+    assert system.image is not None  # the caller looked
+    return system.image.parameters["curvature"]
+
+
+def _by_block(block: Tensor, values: Tensor) -> Tensor:
+    """Return sums (blocks, K) of values (N, K), on the CPU."""
+    found = values.new_zeros(_BLOCKS, values.shape[1])
+    return found.index_add_(0, block, values).cpu()
+
+
+def _sums(points: Tensor, light: Tensor, block: Tensor, radius: float) -> Tensor:
+    """Return moments (blocks, 6) of light on the sensor: 1, x, y, x², xy, y²."""
+    x, y = points.unbind(-1)
+    light = light * (x * x + y * y < radius * radius)
+    lx, ly = light * x, light * y
+    return _by_block(block, torch.stack((light, lx, ly, lx * x, lx * y, ly * y), -1))
+
+
+def _with_errors(
+    sums: Tensor, entering: Tensor, smallest: Tensor, count: int
+) -> tuple[GhostMeasures, GhostMeasures, tuple[float, float]]:
+    """Return measures, their standard errors, and the image's share with its error.
+
+    Args:
+        sums: (P + 1, blocks, 6), the image's last.
+        entering: (blocks,).
+        smallest: (P,), mm²: no ghost is smaller than a disc of diffraction.
+        count: of rays that enter the front surface.
+    """
+    all_of, front = sums.sum(1), entering.sum()
+    # Without one block after the other.
+    scale = _BLOCKS / (_BLOCKS - 1.0)
+    others = scale * (all_of - sums.transpose(0, 1))
+    fronts = scale * (front - entering)
+    found = _measures(all_of[None], front[None], smallest)
+    left = _measures(others, fronts, smallest)
+    errors = [((_BLOCKS - 1.0) / _BLOCKS * (v - v.mean(0)).square().sum(0)).sqrt() for v in left]
+    values = [v[0] for v in found]
+    # None of so many rays arrived: the share may be that of one.
+    image, image_error = float(values[0][-1]), float(errors[0][-1])
+    dark = values[0][:-1] == 0.0
+    errors[0][:-1][dark] = 1.0 / max(count, 1)
+    errors[1][dark] = 1.0 / max(count, 1)
+    measures = GhostMeasures(values[0][:-1], *values[1:])
+    return measures, GhostMeasures(errors[0][:-1], *errors[1:]), (image, image_error)
+
+
+def _measures(sums: Tensor, front: Tensor, smallest: Tensor) -> list[Tensor]:
+    """Return the share (B, P + 1), and the other `GhostMeasures` (B, P), of sums (B, P + 1, 6)."""
+    light, lx, ly, lxx, lxy, lyy = sums.unbind(-1)
+    share = light / front[:, None]
+    light, lx, ly, lxx, lxy, lyy = (v[:, :-1] for v in (light, lx, ly, lxx, lxy, lyy))
+    x, y = lx / light, ly / light
+    xx, xy, yy = lxx / light - x * x, lxy / light - x * y, lyy / light - y * y
+    power = share[:, :-1] / share[:, -1:]
+    area = ghost_area(xx, xy, yy, smallest)
+    irradiance = torch.where(light > 0.0, light / area, 0.0)
+    rms = (xx + yy).clamp(min=0.0).sqrt()
+    power = torch.where(share[:, -1:] > 0.0, power, math.nan)
+    return [share, power, irradiance, x, y, rms]
+
+
+def ghost_area(xx: Tensor, xy: Tensor, yy: Tensor, smallest: Tensor | float) -> Tensor:
+    """Return the area (mm²) of the uniform ellipse that has these variances (mm²), and no less than
+    the smallest.
+    """
+    determinant = (xx * yy - xy * xy).clamp(min=0.0)
+    return torch.maximum(4.0 * math.pi * determinant.sqrt(), torch.as_tensor(smallest).to(xx))
