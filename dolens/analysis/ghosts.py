@@ -21,10 +21,10 @@ front alone; errors are standard errors by leaving out one block after the other
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,15 +34,17 @@ from dolens.errors import InputError, check_count
 from dolens.optics.aiming import field_line, launch
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.ghost_paths import (
+    GhostFirstOrder,
     Path,
     check_path,
     ghost_path_systems,
     ghost_paths,
+    ghosts_first_order,
+    reflecting_surfaces,
     unfolded,
 )
 from dolens.optics.image_surface import WITHOUT_EDGE
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import behind_surfaces, curvatures_of, first_order, powers_of, vergence
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
@@ -55,8 +57,6 @@ _BLOCKS = 8
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 # Rings and azimuths of the front surface whose light is looked for, and room about them.
 _RINGS, _AZIMUTHS, _ROOM = 8, 72, 1.01
-# First zero of Bessel's J₁ over 2π.
-_AIRY = 0.6098349456332723
 
 
 class GhostMeasures(NamedTuple):
@@ -79,24 +79,6 @@ class GhostMeasures(NamedTuple):
     rms: Tensor
 
 
-class GhostFirstOrder(NamedTuple):
-    """First-order optics of P unfolded paths, each number (P,), mm; infinite where there is none.
-
-    Attributes:
-        focus: from the sensor to where an axial beam is focused; negative in front of it.
-        efl: effective focal length of the path.
-        marginal: height at the sensor of the marginal ray of the lens's axial beam.
-        pupil: from the sensor to the image of the stop, as its first pass is seen from behind.
-        slope: of the marginal ray at the sensor.
-    """
-
-    focus: Tensor
-    efl: Tensor
-    marginal: Tensor
-    pupil: Tensor
-    slope: Tensor
-
-
 @dataclass(frozen=True)
 class Ghosts:
     """The ghosts of one object point, in the order of their irradiance, the brightest first.
@@ -110,7 +92,6 @@ class Ghosts:
         image: share of the light that enters the front surface that arrives in the image.
         image_error: its standard error.
         rays: of each path and wavelength that enter the front surface.
-        sensor: number of the sensor among the surfaces, one more than the last.
     """
 
     where: Conditions
@@ -121,7 +102,6 @@ class Ghosts:
     image: float
     image_error: float
     rays: int
-    sensor: int
 
     @property
     def total(self) -> float:
@@ -137,7 +117,7 @@ class FrontRays:
         rays: (N,).
         weight: (N,), of a ray: the area (mm²) that it stands for where the light is as strong as at
             the first vertex.
-        block: (N,), int64, from 0.
+        block: (blocks, N), one where a ray is in a block, else zero.
         ends: (N,), int64: twice the number of the surface where the ray ends on the image's path,
             and one more where it is reflected totally; more than any where it arrives.
         image: (N,), bool: it arrives in the image.
@@ -156,7 +136,7 @@ class FrontRays:
         # They come first; see `front_rays`.
         count = int((self.ends > 2 * path[0]).sum())
         rays = Rays(self.rays.position[:count], self.rays.direction[:count], self.rays.wavelength)
-        return rays, self.weight[:count], self.block[:count]
+        return rays, self.weight[:count], self.block[:, :count]
 
 
 @torch.no_grad()
@@ -183,43 +163,26 @@ def ghosts(
         InputError: more or fewer than one field, a number out of range, or a path that there is
             not.
     """
-    check_count("rays", rays)
-    if len(where.fields) != 1:
-        raise InputError(f"ghosts are those of one field, not of {len(where.fields)}")
-    if not 0.0 <= sensor_reflectance <= 1.0:
-        raise InputError(f"sensor_reflectance: {sensor_reflectance}; allowed: 0 to 1")
     lens = in_double_precision(lens)
-    system = lens.system()
-    reflects = sensor_reflectance > 0.0
-    if paths is None:
-        chosen = ghost_paths(system, bounces, reflects)
-    else:
-        chosen = [check_path(system, path, reflects) for path in paths]
-    if not chosen:
-        raise InputError(f"lens '{lens.name}': no two surfaces reflect light, and no ghosts are")
+    chosen = chosen_paths(lens, bounces, sensor_reflectance > 0.0, paths)
+    where = where.that_count()
     radius = 0.5 * lens.sensor_diameter if lens.sensor_diameter else math.inf
-    sums = torch.zeros(len(chosen) + 1, _BLOCKS, 6, dtype=torch.float64)
-    entering = torch.zeros(_BLOCKS, dtype=torch.float64)
+    places = {ENTERING: 0, IMAGE: 1} | {path: place for place, path in enumerate(chosen, 2)}
+    sums = torch.zeros(len(places), _BLOCKS, 6, dtype=torch.float64)
     count = 0
-    for wave, share in zip(where.wavelengths.tolist(), where.weights.tolist(), strict=True):
-        front = front_rays(lens, where, wave, rays)
-        count = max(count, len(front.weight))
-        entering += share * _by_block(front.block, front.weight[:, None])[:, 0]
-        passing = PassedShares(system, wave, sensor_reflectance)
-        light = share * passing.of(()) * front.weight * front.image
-        sums[-1] += _sums(front.landed, light, front.block, radius)
-        catching = sensor_aperture(lens)
-        for number, ghost in enumerate(ghost_path_systems(system, chosen, catching)):
-            beam, weight, block = front.of(chosen[number])
-            if len(weight):
-                hit = trace_rays(ghost, beam)
-                light = share * passing.of(chosen[number]) * (weight * hit.valid)
-                sums[number] += _sums(hit.position[:, :2], light, block, radius)
-    first = ghosts_first_order(system, chosen, where.reference_wavelength, where.object_distance)
-    longest = float(where.wavelengths.max()) * 1e-6
-    smallest = math.pi * (_AIRY * longest / first.slope.abs()).square()
-    found, errors, image = _with_errors(sums, entering, smallest, count)
-    order = found.irradiance.nan_to_num(-1.0).argsort(descending=True, stable=True)
+    for path, points, light, block in ghost_light(lens, where, chosen, rays, sensor_reflectance):
+        if path == ENTERING:
+            count = max(count, len(light))
+        sums[places[path]] += _sums(points, light, block, math.inf if path == ENTERING else radius)
+    first = ghosts_first_order(
+        lens.system(), chosen, where.reference_wavelength, where.object_distance
+    )
+    smallest = math.pi * first.diffraction(float(where.wavelengths.max())).square().nan_to_num()
+    passing = PassedShares(lens.system(), where.reference_wavelength, sensor_reflectance)
+    # Of a path without light: the share of one ray.
+    least = torch.tensor([passing.of(path) for path in chosen], dtype=torch.float64) / count
+    found, errors, image = _with_errors(sums[1:], sums[0, :, 0], smallest, least)
+    order = found.irradiance.argsort(descending=True, stable=True)
     return Ghosts(
         where,
         tuple(chosen[number] for number in order.tolist()),
@@ -228,8 +191,88 @@ def ghosts(
         GhostFirstOrder(*(values[order] for values in first)),
         *image,
         count,
-        len(system.surfaces) + 1,
     )
+
+
+def chosen_paths(
+    lens: Lens, bounces: int, sensor: bool, paths: Sequence[Sequence[int]] | None
+) -> list[Path]:
+    """Return the paths that are asked for; arguments and errors are those of `ghosts`."""
+    system = lens.system()
+    if paths is None:
+        found = ghost_paths(system, bounces, sensor)
+    else:
+        found = [check_path(system, path, sensor) for path in paths]
+    if not found:
+        raise InputError(
+            f"lens '{lens.name}': ghosts need two surfaces that reflect light; it has "
+            f"{len(reflecting_surfaces(system, sensor))}"
+        )
+    return found
+
+
+# Stand for paths: the light that enters the front surface, and the image's.
+ENTERING: Path = (0,)
+IMAGE: Path = ()
+
+
+class GhostLight(NamedTuple):
+    """The light of N rays of one path and wavelength.
+
+    Attributes:
+        path: surfaces that reflect, or one of `ENTERING` and `IMAGE`.
+        points: (N, 2), mm, where it lands on the sensor; of the first it means nothing.
+        light: (N,), mm²: the area, in front of the lens, from which it comes times the share that
+            passes; zero of rays that do not arrive.
+        block: (blocks, N), one where a ray is in a block, else zero.
+    """
+
+    path: Path
+    points: Tensor
+    light: Tensor
+    block: Tensor
+
+
+def ghost_light(
+    lens: Lens,
+    where: Conditions,
+    paths: Sequence[Path],
+    rays: int,
+    sensor_reflectance: float = 0.0,
+) -> Iterator[GhostLight]:
+    """Yield where the light of an object point lands: of each wavelength the light that enters, the
+    image, and all paths.
+
+    Args:
+        lens: in double precision.
+        where: one field, wavelengths that count, and object distance.
+        paths: as `ghost_paths` gives them.
+        rays: as of `ghosts`, as the last argument.
+
+    Raises:
+        InputError: more or fewer than one field, a number out of range, or no light that enters.
+    """
+    check_count("rays", rays, _BLOCKS)
+    if len(where.fields) != 1:
+        raise InputError(f"ghosts are those of one field, not of {len(where.fields)}")
+    if not 0.0 <= sensor_reflectance <= 1.0:
+        raise InputError(f"sensor_reflectance: {sensor_reflectance}; allowed: 0 to 1")
+    system, catching = lens.system(), sensor_aperture(lens)
+    for wave, share in zip(where.wavelengths.tolist(), where.weights.tolist(), strict=True):
+        front = front_rays(lens, where, wave, rays)
+        if not len(front.weight):
+            field = tuple(where.fields[0].tolist())
+            raise InputError(f"ghosts: no light of field {field} enters the front surface")
+        passing = PassedShares(system, wave, sensor_reflectance)
+        yield GhostLight(ENTERING, front.landed, share * front.weight, front.block)
+        light = share * passing.of(IMAGE) * front.weight * front.image
+        yield GhostLight(IMAGE, front.landed, light, front.block)
+        for path, ghost in zip(paths, ghost_path_systems(system, paths, catching), strict=True):
+            beam, weight, block = front.of(path)
+            if len(weight):
+                hit = trace_rays(ghost, beam)
+                light = share * passing.of(path) * (weight * hit.valid)
+                yield GhostLight(path, hit.position[:, :2], light, block)
 
 
 def sensor_aperture(lens: Lens) -> ClearAperture:
@@ -299,7 +342,7 @@ def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> 
     return FrontRays(
         Rays(rays.position[kept], rays.direction[kept], wavelength),
         weight[kept],
-        block[kept],
+        (block[kept] == torch.arange(_BLOCKS).to(block)[:, None]).double(),
         ends[kept],
         hit.valid[kept],
         hit.position[kept][:, :2],
@@ -337,96 +380,24 @@ def front_box(system: OpticalSystem, line: Tensor, near: float) -> tuple[Tensor,
     return (middle - half).to(line), (middle + half).to(line)
 
 
-def ghosts_first_order(
-    system: OpticalSystem,
-    paths: Sequence[Path],
-    wavelength: float,
-    object_distance: float | None = None,
-) -> GhostFirstOrder:
-    """Return first-order optics of unfolded paths, without gradients.
-
-    `dolens.optics.paraxial.first_order` of a path's system gives the same with gradients.
-
-    Args:
-        system: the lens.
-        paths: as `ghost_paths` gives them.
-        wavelength: nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-    """
-    # Python's numbers take a hundredth of the time of tensors.
-    curvatures, gaps, indices = (
-        [float(value) for value in values]
-        for values in (
-            [*curvatures_of(system), 0.0 if system.image is None else _curvature(system)],
-            [*system.thicknesses, system.sensor_distance],
-            system.indices(wavelength),
-        )
-    )
-    powers = powers_of(system, wavelength)
-    added = [0.0] * len(curvatures) if powers is None else [*map(float, powers), 0.0]
-    first = first_order(system, wavelength, object_distance)
-    near = indices[0] * float(vergence(object_distance))
-    pupil = first.entrance_pupil
-    height = 0.5 * float(pupil.diameter)
-    if near:
-        # From the axial object point to the rim of the pupil.
-        height /= 1.0 + float(pupil.z) * float(vergence(object_distance))
-    rows = []
-    negative = [-gap for gap in gaps]
-    for path, ghost in zip(paths, ghost_path_systems(system, paths), strict=True):
-        way = unfolded(path, len(system.surfaces))
-        n = [s * indices[medium] for s, medium in zip(ghost.senses, way.media, strict=True)]
-        c = [curvatures[number - 1] for number in way.numbers]
-        t = way.between(gaps, negative)
-        # A surface that reflects does not deflect by its law.
-        p = [0.0 if i in way.bounces else added[m - 1] for i, m in enumerate(way.numbers)]
-        a, b, low, d = behind_surfaces(c, t, n, p)
-        behind, distance = n[-1], gaps[-1]
-        y, nu = height * (a + b * near), height * (low + d * near)
-        stop = ghost.stop - 1
-        _, b_stop, _, d_stop = behind_surfaces(c[stop:], t[stop:], n[stop:], p[stop:])
-        rows.append(
-            (
-                math.inf if nu == 0.0 else -behind * y / nu - distance,
-                math.inf if low == 0.0 else -1.0 / low,
-                y + nu / behind * distance,
-                math.inf if d_stop == 0.0 else -behind * b_stop / d_stop - distance,
-                nu / behind,
-            )
-        )
-    found = torch.tensor(rows, dtype=torch.float64)
-    return GhostFirstOrder(*found.unbind(-1))
-
-
-def _curvature(system: OpticalSystem) -> Any:
-    assert system.image is not None  # the caller looked
-    return system.image.parameters["curvature"]
-
-
-def _by_block(block: Tensor, values: Tensor) -> Tensor:
-    """Return sums (blocks, K) of values (N, K), on the CPU."""
-    found = values.new_zeros(_BLOCKS, values.shape[1])
-    return found.index_add_(0, block, values).cpu()
-
-
 def _sums(points: Tensor, light: Tensor, block: Tensor, radius: float) -> Tensor:
     """Return moments (blocks, 6) of light on the sensor: 1, x, y, x², xy, y²."""
     x, y = points.unbind(-1)
     light = light * (x * x + y * y < radius * radius)
     lx, ly = light * x, light * y
-    return _by_block(block, torch.stack((light, lx, ly, lx * x, lx * y, ly * y), -1))
+    return (block @ torch.stack((light, lx, ly, lx * x, lx * y, ly * y), -1)).cpu()
 
 
 def _with_errors(
-    sums: Tensor, entering: Tensor, smallest: Tensor, count: int
+    sums: Tensor, entering: Tensor, smallest: Tensor, least: Tensor
 ) -> tuple[GhostMeasures, GhostMeasures, tuple[float, float]]:
     """Return measures, their standard errors, and the image's share with its error.
 
     Args:
-        sums: (P + 1, blocks, 6), the image's last.
+        sums: (1 + P, blocks, 6), the image's first.
         entering: (blocks,).
         smallest: (P,), mm²: no ghost is smaller than a disc of diffraction.
-        count: of rays that enter the front surface.
+        least: (P,), error of the share where no ray arrives.
     """
     all_of, front = sums.sum(1), entering.sum()
     # Without one block after the other.
@@ -437,27 +408,26 @@ def _with_errors(
     left = _measures(others, fronts, smallest)
     errors = [((_BLOCKS - 1.0) / _BLOCKS * (v - v.mean(0)).square().sum(0)).sqrt() for v in left]
     values = [v[0] for v in found]
-    # None of so many rays arrived: the share may be that of one.
-    image, image_error = float(values[0][-1]), float(errors[0][-1])
-    dark = values[0][:-1] == 0.0
-    errors[0][:-1][dark] = 1.0 / max(count, 1)
-    errors[1][dark] = 1.0 / max(count, 1)
-    measures = GhostMeasures(values[0][:-1], *values[1:])
-    return measures, GhostMeasures(errors[0][:-1], *errors[1:]), (image, image_error)
+    image, image_error = float(values[0][0]), float(errors[0][0])
+    dark = values[0][1:] == 0.0
+    errors[0][1:][dark] = least[dark]
+    errors[1][dark] = least[dark] / image if image > 0.0 else math.nan
+    measures = GhostMeasures(values[0][1:], *values[1:])
+    return measures, GhostMeasures(errors[0][1:], *errors[1:]), (image, image_error)
 
 
 def _measures(sums: Tensor, front: Tensor, smallest: Tensor) -> list[Tensor]:
-    """Return the share (B, P + 1), and the other `GhostMeasures` (B, P), of sums (B, P + 1, 6)."""
+    """Return the share (B, 1 + P), and the other `GhostMeasures` (B, P), of sums (B, 1 + P, 6)."""
     light, lx, ly, lxx, lxy, lyy = sums.unbind(-1)
     share = light / front[:, None]
-    light, lx, ly, lxx, lxy, lyy = (v[:, :-1] for v in (light, lx, ly, lxx, lxy, lyy))
+    light, lx, ly, lxx, lxy, lyy = (v[:, 1:] for v in (light, lx, ly, lxx, lxy, lyy))
     x, y = lx / light, ly / light
     xx, xy, yy = lxx / light - x * x, lxy / light - x * y, lyy / light - y * y
-    power = share[:, :-1] / share[:, -1:]
+    power = share[:, 1:] / share[:, :1]
     area = ghost_area(xx, xy, yy, smallest)
     irradiance = torch.where(light > 0.0, light / area, 0.0)
     rms = (xx + yy).clamp(min=0.0).sqrt()
-    power = torch.where(share[:, -1:] > 0.0, power, math.nan)
+    power = torch.where(share[:, :1] > 0.0, power, math.nan)
     return [share, power, irradiance, x, y, rms]
 
 
