@@ -237,6 +237,11 @@ def _check_kinds(lens: Lens, object_distance: float | None) -> None:
     if object_distance is not None:
         raise InputError(f"{name} has a near object; allowed: one at infinity")
     for number, surface in lens.surfaces.items():
+        if surface.coating is not None:
+            raise InputError(
+                f"{name}: surface {number} has a coating, and a search's lenses have none; search "
+                "from lens.coated('ideal')"
+            )
         others = {n for n, p in surface.named_parameters() if bool((p != 0.0).any())}
         if others - {"curvature"} or surface.law is not None or surface.changes_axes:
             raise InputError(f"{name}: surface {number}; allowed: spheres and planes in line")

@@ -147,6 +147,9 @@ _STATUS = {
     6: "experimental",
 }
 
+# Internal transmittances are printed to three or four digits.
+_LEAST_SHARE = 1e-4
+
 STATUSES = tuple(_STATUS.values())
 
 
@@ -182,6 +185,20 @@ class AgfGlass:
     density: float | None
     price: float | None
     resistances: tuple[tuple[str, float], ...]
+
+    @property
+    def absorptions(self) -> tuple[tuple[float, float], ...]:
+        """Return rows of wavelength (nm) and absorption (1/mm), by Beer's law τ = exp(-a·d).
+
+        A share that is printed as zero is less than the last digit that catalogues print: it counts
+        as 1e-4.  Of several rows at one wavelength the thickest counts: it is known best.
+        """
+        found: dict[float, tuple[float, float]] = {}
+        for at, share, path in self.transmittance:
+            nm = round(1000.0 * at, 6)
+            if path > found.get(nm, (0.0, 0.0))[0]:
+                found[nm] = path, -math.log(max(share, _LEAST_SHARE)) / path
+        return tuple((nm, found[nm][1]) for nm in sorted(found))
 
 
 @dataclass
@@ -274,39 +291,6 @@ def read_entry(entry: AgfEntry) -> AgfGlass:
         expansions[2] if len(expansions) > 2 and expansions[2] > 0.0 else None,
         *_price_and_resistances(entry),
     )
-
-
-def internal_transmittance(glass: AgfGlass, wavelength: float, thickness: float) -> float:
-    """Return the share of light that a thickness of glass lets pass, without its surfaces' loss.
-
-    Beer's law gives τ = τ₀^(d/d₀) at the wavelengths of the catalogue; the exponent's rate is
-    interpolated linearly between them.
-
-    Args:
-        glass: an entry that gives transmittances.
-        wavelength: nm.
-        thickness: mm.
-
-    Raises:
-        InputError: the catalogue gives no transmittance at that wavelength.
-    """
-    micrometres = wavelength / 1000.0
-    rows = sorted(glass.transmittance)
-    if not rows or not rows[0][0] <= micrometres <= rows[-1][0]:
-        raise InputError(
-            f"glass '{glass.name}': its catalogue gives no transmittance at {wavelength:g} nm"
-        )
-    rates = [(at, -math.log(share) / path if share > 0.0 else math.inf) for at, share, path in rows]
-    if len(rates) == 1:
-        return math.exp(-rates[0][1] * thickness)
-    behind = next(n for n in range(1, len(rates)) if micrometres <= rates[n][0])
-    (first, low), (last, high) = rates[behind - 1 : behind + 1]
-    share = (micrometres - first) / (last - first) if last > first else 0.0
-    if share in (0.0, 1.0):
-        rate = high if share else low
-    else:
-        rate = low + share * (high - low) if math.isfinite(low + high) else math.inf
-    return math.exp(-rate * thickness)
 
 
 def _thermal(entry: AgfEntry) -> ThermalCoefficients | None:

@@ -12,8 +12,9 @@ Schott's dn/dT constants are defined with it (TIE-19), and Zemax uses it.  Ciddo
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -140,6 +141,7 @@ class Glass:
         thermal: how the index changes with temperature; None where the catalogue does not say.
         expansion: 1/K, linear; None where the catalogue does not say.
         environment: temperature and pressure; None: those of the catalogue.
+        absorptions: rows of nm and 1/mm, from the internal transmittances of its catalogue.
     """
 
     name: str
@@ -151,6 +153,7 @@ class Glass:
     thermal: ThermalCoefficients | None = None
     expansion: float | None = None
     environment: Environment | None = None
+    absorptions: tuple[tuple[float, float], ...] = ()
 
     def __hash__(self) -> int:
         # Names nearly always differ where glasses do; a trace looks media up in dictionaries.
@@ -209,6 +212,31 @@ class Glass:
         if self.thermal:
             absolute = absolute + absolute_change(relative, light, self.thermal, here.temperature)
         return absolute / air
+
+    def absorption(self, wavelength: float | Tensor) -> float | Tensor:
+        """Return how fast light is absorbed, 1/mm, at wavelengths in nm; linear between the rows.
+
+        It is zero where the catalogue gives none; see `knows_absorption`.
+        """
+        if not self.absorptions:
+            return 0.0
+        if not isinstance(wavelength, Tensor):
+            return float(self.absorption(torch.tensor(wavelength, dtype=torch.float64)))
+        options: Any = {"dtype": torch.float64, "device": wavelength.device}
+        at, rate = torch.tensor(list(zip(*self.absorptions, strict=True)), **options)
+        given = wavelength.detach().to(torch.float64)
+        high = torch.bucketize(given.contiguous(), at).clamp(1, max(len(at) - 1, 1))
+        low, high = high - 1, high.clamp(max=len(at) - 1)
+        gap = at[high] - at[low]
+        share = (given - at[low]) / gap.where(gap > 0.0, 1.0)
+        found = rate[low] + share * (rate[high] - rate[low])
+        inside = (given >= at[0]) & (given <= at[-1])
+        return found.where(inside, 0.0).to(wavelength.dtype)
+
+    def knows_absorption(self, wavelength: float) -> bool:
+        """Return whether the catalogue gives internal transmittances around a wavelength (nm)."""
+        rows = self.absorptions
+        return bool(rows) and rows[0][0] <= wavelength <= rows[-1][0]
 
     def _require_within_range(self, wavelength: float | Tensor) -> None:
         first, last = self.wavelengths

@@ -342,6 +342,7 @@ def user_glass(catalogue: str, entry: AgfEntry) -> Glass:
         (first, last),
         thermal=glass.thermal,
         expansion=glass.expansion,
+        absorptions=glass.absorptions,
     )
 
 

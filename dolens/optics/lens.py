@@ -278,7 +278,11 @@ class Lens(LensRays, InStates, nn.Module):
             if surface.phase is not None:
                 own = _stored_or_given(surface.phase, values, f"surfaces.{number}.phase.")
                 law = LawState(type(surface.phase), own)
-            state = SurfaceState(type(surface), parameters, aperture, edge, law)
+            coating = None
+            if surface.coating is not None:
+                own = _stored_or_given(surface.coating, values, f"surfaces.{number}.coating.")
+                coating = surface.coating.state(own)
+            state = SurfaceState(type(surface), parameters, aperture, edge, law, coating)
             astigmatism = astigmatism_of(self, number, values) if values else None
             surfaces.append(irregular(state, astigmatism) if astigmatism else state)
         thicknesses = [
@@ -326,7 +330,12 @@ class Lens(LensRays, InStates, nn.Module):
         return self.trace(rays)
 
     def trace(
-        self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
+        self,
+        rays: Rays,
+        record: bool = False,
+        first: int = 1,
+        last: int | None = None,
+        transmission: bool = False,
     ) -> TracedRays:
         """Trace rays from the object through every surface to the sensor, plane or curved.
 
@@ -342,9 +351,10 @@ class Lens(LensRays, InStates, nn.Module):
             record: whether to keep the intersection with every surface.
             first: number of the first surface that they meet.
             last: number of the last; given, the trace ends there, in the medium behind it.
+            transmission: whether to find which share of the light arrives; see `TracedRays`.
         """
         self._check_range(first, last)
-        return trace_rays(self._system_for(rays), rays, 1.0, record, first, last)
+        return trace_rays(self._system_for(rays), rays, 1.0, record, first, last, transmission)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None

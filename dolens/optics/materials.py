@@ -200,6 +200,14 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
     return Material(name, nd - b / line_d**2, b)
 
 
+def absorption(medium: Medium, wavelength: float | Tensor) -> float | Tensor:
+    """Return how fast light is absorbed in a medium, 1/mm: I = I₀·exp(-a·t), at wavelengths in nm.
+
+    It is zero where no catalogue gives an internal transmittance.
+    """
+    return medium.absorption(wavelength) if isinstance(medium, Glass) else 0.0
+
+
 def is_glass(medium: Medium) -> bool:
     """Return whether light is in a solid or liquid there: not in air, and not at a mirror."""
     return medium.name not in NO_GLASS

@@ -31,6 +31,7 @@ class Unit(NamedTuple):
 
 DEGREE = Unit("deg", math.pi / 180.0)
 MILLIMETRE = Unit("mm")
+NANOMETRE = Unit("nm")
 PER_MILLIMETRE = Unit("1/mm")
 RADIAN = Unit("rad")
 WAVE = Unit("waves")
@@ -62,6 +63,8 @@ def unit_of(name: str) -> Unit:
     first, _, _ = name.partition(".")
     group, _, last = name.rpartition(".")
     others = UNNAMED
+    if group.endswith(".coating"):
+        return NANOMETRE
     if group.endswith(".phase"):
         # Zernike's coefficients are waves, all others radians.
         others = WAVE if last[:1] == "z" else RADIAN

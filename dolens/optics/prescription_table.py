@@ -1,7 +1,7 @@
 """The prescription of a lens as a table of plain values: what `repr(lens)` and pages show."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -109,6 +109,7 @@ class PrescriptionTable:
         carried: name of an element with a pose → the first and the last of its surfaces.
         sensor_radius: mm, of a curved sensor; `inf` of a plane one.
         sensor_conic: its conic constant; 0 of a sphere.
+        coatings: what a coating is, in words → the surfaces that have it.
     """
 
     name: str
@@ -122,6 +123,7 @@ class PrescriptionTable:
     carried: dict[str, tuple[int, int]]
     sensor_radius: float = math.inf
     sensor_conic: float = 0.0
+    coatings: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def heading(self) -> str:
@@ -132,8 +134,11 @@ class PrescriptionTable:
 
     @property
     def notes(self) -> list[str]:
-        """Return lines about elements with a pose of their own."""
-        found = []
+        """Return lines about coatings, and about elements with a pose of their own."""
+        found = [
+            printable(f"coating of {_surfaces(numbers)}: {coating}")
+            for coating, numbers in self.coatings.items()
+        ]
         for name, pose in self.elements.items():
             first, last = self.carried[name]
             values = ", ".join(f"{key} {_number(value)}{_unit(key)}" for key, value in pose.items())
@@ -160,7 +165,7 @@ class PrescriptionTable:
         """Return the table as HTML, all text escaped."""
         rows = [["∞" if cell == "inf" else cell for cell in row] for row in self.cells()]
         notes = [[note] for note in self.notes]
-        beside = html_table(["elements"], notes) if notes else ""
+        beside = html_table(["notes"], notes) if notes else ""
         return html_table(HEADINGS, rows, self.heading, {0, 1}) + beside
 
 
@@ -179,7 +184,9 @@ def prescription_table(lens: Any) -> PrescriptionTable:
     surfaces = zip(lens.surfaces.values(), gaps, lens.materials[1:], strict=True)
     for number, (surface, gap, medium) in enumerate(surfaces, 1):
         values = {
-            name: float(value) for name, value in surface.named_parameters() if value.ndim == 0
+            name: float(value)
+            for name, value in surface.named_parameters()
+            if value.ndim == 0 and not name.startswith("coating.")
         }
         if surface.changes_axes:
             turned = {n: to_file_units(n, value) for n, value in values.items()}
@@ -218,7 +225,24 @@ def prescription_table(lens: Any) -> PrescriptionTable:
         {name: _pose(element) for name, element in lens.elements.items()},
         carried,
         *_sensor_shape(lens),
+        _coatings(lens),
     )
+
+
+def _coatings(lens: Any) -> dict[str, tuple[int, ...]]:
+    """Return what coatings there are, and their surfaces."""
+    found: dict[str, tuple[int, ...]] = {}
+    for number, surface in enumerate(lens.surfaces.values(), 1):
+        if surface.coating is not None:
+            said = surface.coating.description
+            found[said] = (*found.get(said, ()), number)
+    return found
+
+
+def _surfaces(numbers: tuple[int, ...]) -> str:
+    """Return `surface 1` or `surfaces 1, 2 and 4`."""
+    *others, last = map(str, numbers)
+    return f"surfaces {', '.join(others)} and {last}" if others else f"surface {last}"
 
 
 def _sensor_shape(lens: Any) -> tuple[float, float]:

@@ -35,6 +35,7 @@ def trace_rays(
     record: bool = False,
     first: int = 1,
     last: int | None = None,
+    transmission: bool = False,
 ) -> TracedRays:
     """Trace rays through surfaces `first` to `last`, and to the sensor where no last is given.
 
@@ -45,6 +46,7 @@ def trace_rays(
         record: keep the intersections; the reference does this.
         first: number of the first surface.
         last: number of the last, or None.
+        transmission: find the share of light that arrives; the reference does this.
 
     Raises:
         InputError: the lens asks for kernels by name that cannot serve.
@@ -53,14 +55,14 @@ def trace_rays(
         rays = from_sensor(system, rays)
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
-    reference = record or choose_backend(system, rays) == "reference"
+    reference = record or transmission or choose_backend(system, rays) == "reference"
     ray = before = None
     if reference or _is_finer(rays, system.dtype):
         ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     if reference:
         assert ray is not None  # it entered above
         traced = trace_surfaces(
-            system, ray, rays.wavelength, sense, True, record, first=first, last=last
+            system, ray, rays.wavelength, sense, True, record, first, last, transmission
         )
         if to_sensor:
             traced = trace_to_sensor(system, traced, rays.wavelength)

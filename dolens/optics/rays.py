@@ -122,6 +122,9 @@ class TracedRays:
         status: (...), int8, a `Status`.
         surface: (...), int16: number of the surface where that happened, 0 where the ray is valid.
         path_length: (...), mm: Σ n·t along the ray, from its origin.
+        transmission: (...), the share of unpolarised light that arrives, or None where the trace
+            was not asked for it: the product of (T_s + T_p)/2 of every surface, or (R_s + R_p)/2 of
+            a mirror, and of the glasses' internal transmittances from the ray's origin.
         points: (surfaces, ..., 3), mm, or None: the intersections in the order of the surfaces
             that the ray met, when the trace was asked to record them.
 
@@ -136,6 +139,7 @@ class TracedRays:
     surface: Tensor
     path_length: Tensor
     points: Tensor | None = None
+    transmission: Tensor | None = None
 
     def components(self) -> Components:
         """Position and direction as six tensors of the leading shape."""

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.elements import Axes, ElementState, surface_axes
-from dolens.optics.materials import Medium
+from dolens.optics.materials import Medium, absorption
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
 from dolens.optics.surfaces.deflection import Law
@@ -135,6 +135,14 @@ class OpticalSystem:
             if offset is not None:
                 ordered[k] = ordered[k] + offset.double()
         return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
+
+    def absorptions(self, wavelength: float | Tensor) -> list[float | Tensor]:
+        """Return how fast light is absorbed before surface 1 and behind each surface, 1/mm: of the
+        glasses whose catalogues give internal transmittances there; of others zero.
+        """
+        found = {m: absorption(m, wavelength) for m in dict.fromkeys(self.materials)}
+        ordered = [found[medium] for medium in self.materials]
+        return [a.to(self.device, self.dtype) if isinstance(a, Tensor) else a for a in ordered]
 
     def signed_indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Indices as paraxial optics takes them: negative where light travels towards -z."""
@@ -330,9 +338,9 @@ def _places(lens: nn.Module) -> _Places:
     modules: Any = lens._modules
     surfaces = tuple(modules["surfaces"]._modules.values())
     elements = tuple(modules["elements"]._modules.values())
-    phases = (surface.phase for surface in surfaces if surface.phase is not None)
+    parts = (part for s in surfaces for part in (s.phase, s.coating) if part is not None)
     tables = [modules[name]._modules for name in ("surfaces", "elements")]
-    for module in (modules["thicknesses"], *surfaces, *phases, *elements):
+    for module in (modules["thicknesses"], *surfaces, *parts, *elements):
         tables += (module._parameters, module._buffers, module._modules)
     return _Places(
         (lens._parameters, lens._modules, *filter(None, tables)),
@@ -353,6 +361,8 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
             tensors += surface.parameters.values()
             if surface.deflection is not None:
                 tensors += surface.deflection.parameters.values()
+            if surface.coating is not None:
+                tensors += surface.coating.tensors
     for element in system.elements:
         tensors += element.parameters.values()
     return all(id(tensor) in stored for tensor in tensors)

@@ -41,7 +41,9 @@ _POWERS = {
 _ASPHERIC = re.compile(r"a(\d+)")
 # Zernike's and Forbes's coefficients are lengths.
 _LENGTH = re.compile(r"[zq]\d+")
-_PHASE = "phase."
+# Radians and nanometres of these stay as they are: a film is held by the glass, and grows by less
+# than its thickness is known.
+_FIXED = ("phase.", "coating.")
 
 
 def medium_at(medium: Medium, environment: Environment | None) -> Medium:
@@ -178,7 +180,7 @@ def _edge_sag(surface: Surface, values: Mapping[str, Tensor], reach: float) -> T
         values: its parameters and buffers.
         reach: height of the edge, mm.
     """
-    values = {name: value for name, value in values.items() if not name.startswith(_PHASE)}
+    values = {name: value for name, value in values.items() if not name.startswith(_FIXED)}
     if surface.changes_axes or not values:
         return 0.0
     like = next(iter(values.values()))
@@ -208,7 +210,7 @@ def _power(name: str, place: str) -> int:
     aspheric = _ASPHERIC.fullmatch(name)
     if aspheric:
         return 1 - int(aspheric[1])
-    if name.startswith(_PHASE):
+    if name.startswith(_FIXED):
         return 0
     if _LENGTH.fullmatch(name):
         return 1

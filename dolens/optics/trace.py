@@ -43,6 +43,7 @@ class Trace:
         valid: bool.
         margins: per surface met.
         path_length: Σ n·t in mm, or None when it was not asked for.
+        transmission: the share of unpolarised light that arrives, or None.
         points: per surface met, x, y, z in the lens's axes; empty when not recorded.  At a
             coordinate break it is where the ray crosses the plane z = 0 behind it.
         local: the rays on the last surface met, in its axes.
@@ -53,6 +54,7 @@ class Trace:
     valid: Tensor
     margins: list[Margins]
     path_length: Tensor | None
+    transmission: Tensor | None
     points: list[tuple[Tensor, Tensor, Tensor]]
     local: Components
     axes: Axes
@@ -176,6 +178,7 @@ def trace_surfaces(
     record: bool = False,
     first: int = 1,
     last: int | None = None,
+    transmission: bool = False,
 ) -> Trace:
     """Trace rays through surfaces `first` to `last`, in the order that light meets them.
 
@@ -188,6 +191,7 @@ def trace_surfaces(
         record: whether to keep the intersections.
         first: number of the first surface, from 1, as the prescription counts in either sense.
         last: number of the last surface; None: of the lens.
+        transmission: whether to multiply the shares of light that each surface and medium passes.
 
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
@@ -195,6 +199,8 @@ def trace_surfaces(
     indices, places, senses = system.indices(wavelength), system.axes, system.senses
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
+    passed = torch.ones_like(ray.n) if transmission else None
+    absorptions = system.absorptions(wavelength) if transmission else []
     forward = sense > 0.0
     margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -222,6 +228,14 @@ def trace_surfaces(
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
         if record:
             points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
+        if passed is not None:
+            distance = to_plane + t if carried is None else carried + to_plane + t
+            passed = passed * _within(absorptions[front], distance)
+            if surface.coating is not None:
+                passed = passed * surface_share(
+                    surface, (x, y, z), (l, m, n), (before, after), wavelength,
+                    number in system.mirrors, forward,
+                )  # fmt: skip
         transmitted = None
         if surface.deflection is not None:
             media = Media(before, after, per_radian(wavelength, ray.n))
@@ -237,7 +251,44 @@ def trace_surfaces(
         margins.append(Margins(number, met, inside, transmitted))
         ray = Components(x, y, z, l, m, n)
     valid = _all_positive(margins, ray.n)
-    return Trace(to_lens_axes(ray, axes), valid, margins, path, points, ray, axes)
+    return Trace(to_lens_axes(ray, axes), valid, margins, path, passed, points, ray, axes)
+
+
+def _within(absorption: float | Tensor, distance: Tensor) -> Tensor | float:
+    """Return the share of light that passes a distance (mm) of a medium, exp(-a·t)."""
+    if isinstance(absorption, float) and absorption == 0.0:
+        return 1.0
+    return torch.exp(-absorption * distance)
+
+
+def surface_share(
+    surface: SurfaceState,
+    point: tuple[Tensor, Tensor, Tensor],
+    direction: tuple[Tensor, Tensor, Tensor],
+    indices: tuple[float | Tensor, float | Tensor],
+    wavelength: float | Tensor,
+    mirror: bool,
+    forward: bool,
+) -> Tensor:
+    """Return the share of unpolarised light that a coated surface passes, or a mirror reflects.
+
+    Args:
+        surface: with a coating.
+        point: on it, mm, in its axes.
+        direction: of the light that arrives.
+        indices: in front and behind, in the order of the light's travel.
+        wavelength: nm.
+        mirror: whether the surface reflects.
+        forward: whether light travels from the object to the sensor; the other way it meets the
+            coating of a refracting surface from behind.
+    """
+    coating = surface.coating
+    assert coating is not None  # as the argument says
+    if not (mirror or forward):
+        coating = coating.turned_round()
+    cosine = surface.cosine_of_incidence(point, direction)
+    r_s, r_p, t_s, t_p = coating.shares(*indices, cosine, wavelength)
+    return 0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p)
 
 
 def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
@@ -270,11 +321,14 @@ def trace_to_sensor(system: OpticalSystem, traced: Trace, wavelength: float | Te
     else:
         distance, towards = distance_to_plane(traced.ray, z, system.senses[-1])
         ray = transfer(traced.ray, distance)
-    path = traced.path_length
+    path, passed = traced.path_length, traced.transmission
     if path is not None:
         path = path + system.indices(wavelength)[-1] * distance
+    if passed is not None:
+        passed = passed * _within(system.absorptions(wavelength)[-1], distance)
     return replace(
         traced,
+        transmission=passed,
         ray=ray,
         valid=traced.valid & (towards > 0.0),
         margins=[*traced.margins, Margins(len(system.surfaces) + 1, towards, None, None)],
@@ -336,7 +390,11 @@ def traced_rays(traced: Trace, path_before: Tensor | None) -> TracedRays:
                 for point in traced.points
             ]
         )
+    passed = traced.transmission
+    if passed is not None:
+        passed = stop_gradient_where_invalid(passed, traced.valid)
     return TracedRays(
+        transmission=passed,
         position=torch.stack(kept[:3], -1),
         direction=torch.stack(kept[3:], -1),
         valid=traced.valid,

@@ -19,7 +19,7 @@ nd/Vd or nd/Vd/ΔPgF, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
 that stands behind them (see row_data.py).
 A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
-lens (see row_data.py).
+lens (see row_data.py).  Which share of the light passes is said by its `coating` (see coatings.py).
 `thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
@@ -46,6 +46,13 @@ from dolens.prescriptions.apertures import (
     aperture_rows,
     clear_aperture,
     set_automatic_semi_diameters,
+)
+from dolens.prescriptions.coatings import (
+    COATING_KEY,
+    check_coating,
+    coating_from,
+    coating_row,
+    coatings_for,
 )
 from dolens.prescriptions.numbers import (
     as_integer,
@@ -100,6 +107,7 @@ _LENS_KEYS = (
     "index_model",
     "stop",
     "object_material",
+    COATING_KEY,
     "surfaces",
     "elements",
     "sensor",
@@ -107,7 +115,8 @@ _LENS_KEYS = (
     *SYSTEM_DATA_KEYS,
 )
 _SURFACE_KEYS = (
-    *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
+    *("type", "radius", *APERTURE_KEYS, PHASE_KEY, COATING_KEY, "thickness"),
+    *("material", EXPANSION_KEY, "note"),
 )
 
 
@@ -159,6 +168,10 @@ def lens_from_prescription(
         else:
             surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
             materials.append(medium_of(row.get("material"), model, place, air))
+            given = row.get(COATING_KEY)
+            if given is not None:
+                surfaces[-1].coating = coating_from(given, place, model, air, dtype)
+                check_coating(surfaces[-1].coating, materials[-1], place)
         expansions.append(expansion_of(row, materials[-1], place))
         if number < len(rows):
             if row.get("thickness") is None:
@@ -168,6 +181,11 @@ def lens_from_prescription(
             raise InputError(
                 f"{place}: the last surface has no 'thickness'; its gap is 'sensor.distance'"
             )
+    if prescription.get(COATING_KEY) is not None:
+        uncoated = [n for n, row in enumerate(rows, 1) if row.get(COATING_KEY) is None]
+        common = prescription[COATING_KEY]
+        for number, own in coatings_for(surfaces, materials, uncoated, common, where, model, air):
+            surfaces[number - 1].coating = own
     try:
         lens = Lens(
             surfaces,
@@ -230,6 +248,8 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
                 row[key] = number_value
         if surface.phase is not None:
             row[PHASE_KEY] = phase_row(surface.phase)
+        if surface.coating is not None:
+            row[COATING_KEY] = coating_row(surface.coating)
         row |= aperture_rows(surface.aperture)
         row |= _gap(lens, number)
         row["material"] = material.name

@@ -4,6 +4,7 @@ The printed indices are those of the makers' catalogues; the formulas are evalua
 """
 
 import math
+import re
 
 import mpmath
 import pytest
@@ -11,7 +12,8 @@ import torch
 
 from dolens import InputError
 from dolens.files import decode_text
-from dolens.optics.agf import internal_transmittance, parse_agf, read_entry
+from dolens.optics.agf import parse_agf, read_entry
+from dolens.optics.glass_catalog import user_glass
 
 # Name, formula, nd as printed, coefficients, range: one glass of each formula that catalogues use.
 CATALOGUE = """CC a catalogue of many makers
@@ -163,12 +165,30 @@ def test_density(word, density):
 
 
 def test_transmittance_by_beer_s_law():
-    glass = read_entry(catalogue()["N-BK7"])
-    assert internal_transmittance(glass, 400.0, 50.0) == pytest.approx(0.992**2, rel=1e-14)
+    glass = user_glass("OWN", catalogue()["N-BK7"])
+    passed = [math.exp(-d * glass.absorption(nm)) for nm, d in ((400.0, 50.0), (350.0, 10.0))]
+    assert passed[0] == pytest.approx(0.992**2, rel=1e-14)
     middle = math.exp((math.log(0.05) + math.log(0.992)) / 2 / 25 * 10)
-    assert internal_transmittance(glass, 350.0, 10.0) == pytest.approx(middle, rel=1e-14)
-    with pytest.raises(InputError, match="no transmittance at 450 nm"):
-        internal_transmittance(glass, 450.0, 10.0)
+    assert passed[1] == pytest.approx(middle, rel=1e-14)
+    several = torch.tensor([400.0, 350.0, 450.0], dtype=torch.float64)
+    assert glass.absorption(several).tolist() == [glass.absorption(float(w)) for w in several]
+    # The catalogue says nothing of 450 nm: the glass is clear there, and says that it does not know.
+    assert glass.absorption(450.0) == 0.0
+    assert [glass.knows_absorption(nm) for nm in (400.0, 450.0)] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("lines", "share"),
+    [
+        ("IT 0.4 0.9 10\nIT 0.4 0.8 25", 0.8 ** (10 / 25)),
+        ("IT 0.4 0.0 10", 1e-4),
+        ("IT 0.4 1.0 10", 1.0),
+    ],
+)
+def test_the_thickest_sample_counts_and_zero_is_less_than_a_digit(lines, share):
+    text = re.sub(r"(IT .*\n)+", lines + "\n", CATALOGUE)
+    glass = user_glass("OWN", catalogue(text)["N-BK7"])
+    assert math.exp(-10.0 * glass.absorption(400.0)) == pytest.approx(share, rel=1e-14)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])

@@ -33,13 +33,23 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     """Yield what a lens computes, the cheap numbers first; a state of it after the other.
 
     They are: fixed rays through the lens at each of its wavelengths, with their path lengths and
-    validity; margins of its clear apertures, and how large its surfaces are drawn; first-order
+    validity; what its coatings reflect and pass; margins of its clear apertures, and how large its surfaces are drawn; first-order
     numbers; the same rays through the heated lens; sags; vignetting and paraxial chief rays of its
     own fields; their spots and real chief rays, with the means over wavelengths and fields that
     their weights make; its full field.
     """
     there = [lens, *(lens.in_state(name) for name in lens.state_names)]
-    for compute in (_rays, _apertures, _first_order, _hot_rays, _sags, _beams, _spots, _full_field):
+    for compute in (
+        _rays,
+        _coatings,
+        _apertures,
+        _first_order,
+        _hot_rays,
+        _sags,
+        _beams,
+        _spots,
+        _full_field,
+    ):
         for one in there:
             yield _numbers(compute, one)
 
@@ -86,6 +96,14 @@ def _rays(lens: Lens) -> list[Tensor]:
     direction = torch.cat([slope, along], -1)
     hit = lens.trace(Rays(position, direction[:, None, None], _waves(lens)[:, None]))
     return [hit.position, hit.direction, hit.path_length, hit.valid, hit.status]
+
+
+def _coatings(lens: Lens) -> list[Tensor]:
+    cosines = torch.tensor([1.0, 0.8, 0.6], dtype=lens.dtype)
+    waves = _waves(lens)[:, None]
+    coatings = [state.coating for state in lens.system().surfaces if state.coating is not None]
+    found = [part for c in coatings for part in c.shares(1.1, 1.6, cosines, waves)]
+    return found or [torch.zeros(0)]
 
 
 def _apertures(lens: Lens) -> list[Tensor]:

@@ -9,7 +9,7 @@ import torch
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.optics.agf import AgfEntry, internal_transmittance, parse_agf, read_entry
+from dolens.optics.agf import AgfEntry, parse_agf, read_entry
 from dolens.optics.glass import Environment
 from dolens.optics.glass_catalog import user_glass
 from tests.optics.test_agf import CATALOGUE
@@ -31,14 +31,6 @@ NAMED = (
 WAVELENGTHS = torch.logspace(2.2, 3.8, 1100, dtype=torch.float64)
 
 
-def passing(printed, wavelength):
-    """The internal transmittance of 10 mm; nothing where the catalogue gives none."""
-    try:
-        return internal_transmittance(printed, wavelength, 10.0)
-    except InputError:
-        return None
-
-
 @cache
 def numbers(name, lines):
     """Everything that is computed of a glass with these lines; None where it is refused."""
@@ -49,7 +41,7 @@ def numbers(name, lines):
         return None
     glass = user_glass("LENS", entry)
     inside = WAVELENGTHS[WAVELENGTHS.clamp(*glass.wavelengths) == WAVELENGTHS]
-    found = [[passing(printed, wave) for wave in (303.0, 310.0, 350.0, 399.0, 403.0)]]
+    found = [[glass.absorption(wave) for wave in (303.0, 310.0, 350.0, 399.0, 403.0)]]
     for there in (glass, glass.at(Environment(75.0, 0.9))):
         found.append((there.name, len(inside), there.index(inside).tolist(), there.expansion))
     return [*found, printed.status, printed.price, printed.density, printed.resistances]

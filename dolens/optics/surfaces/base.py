@@ -24,6 +24,7 @@ from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
 
 if TYPE_CHECKING:
+    from dolens.optics.coatings import Coating
     from dolens.optics.surfaces.deflection import Law
     from dolens.optics.surfaces.phase import Phase
 
@@ -164,6 +165,7 @@ class Surface(nn.Module):
         law: what deflects light in the place of Snell's law, by the surface's own parameters; see
             `dolens.optics.surfaces.deflection`.
         phase: a grating or a diffractive lens on this surface, or None.
+        coating: what decides which share of the light passes, or None: all of it.
     """
 
     kind: ClassVar[str] = ""
@@ -178,6 +180,7 @@ class Surface(nn.Module):
     changes_axes: ClassVar[bool] = False
     law: ClassVar["type[Law] | None"] = None
     phase: "Phase | None"
+    coating: "Coating | None"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -197,6 +200,7 @@ class Surface(nn.Module):
             aperture = ClearAperture(Circle(float(aperture)))
         self.aperture = aperture
         self.phase = None
+        self.coating = None
         for name, value in parameters.items():
             tensor = tensor_of(value, name, dtype)
             if name in self.constants:

@@ -104,7 +104,7 @@ class Biconic(Surface):
 
     def check_aperture(self) -> None:
         """Check that the clear aperture lies within the sag's branch."""
-        p = {name: value.detach() for name, value in self.named_parameters()}
+        p = {name: value.detach() for name, value in self.named_parameters(recurse=False)}
         x, y = rim_points(self.aperture.edge, p["curvature_x"])
         # A whole hemisphere is allowed, and 1/R has rounded.
         rounding = 4.0 * torch.finfo(p["curvature_x"].dtype).eps

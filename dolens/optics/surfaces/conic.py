@@ -114,7 +114,9 @@ class Conic(Surface):
     @property
     def reach(self) -> float:
         """Return 1/√((1+k)c²), mm; `inf` of a plane, a paraboloid and a hyperboloid."""
-        stored = {name: float(value.detach()) for name, value in self.named_parameters()}
+        stored = {
+            name: float(value.detach()) for name, value in self.named_parameters(recurse=False)
+        }
         c = stored["curvature"]
         alpha = (1.0 + stored.get("conic", 0.0)) * c * c
         return 1.0 / math.sqrt(alpha) if alpha > 0.0 else math.inf

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.optics.coatings import CoatingState
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.deflection import Deflected, Law, Media, Travel, Vector
@@ -33,6 +34,7 @@ class SurfaceState:
         aperture: what light passes.
         edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
         deflection: what deflects light in the place of Snell's law, or None.
+        coating: what decides which share of the light passes, or None: all of it.
     """
 
     shape: type[Surface]
@@ -40,6 +42,7 @@ class SurfaceState:
     aperture: ClearAperture
     edge: Tensor | None = None
     deflection: LawState | None = None
+    coating: CoatingState | None = None
 
     def deflect(self, point: Vector, direction: Vector, media: Media, travel: Travel) -> Deflected:
         """Deflect rays at points (mm) of the surface by its law; see `Law.deflect`."""
@@ -47,6 +50,12 @@ class SurfaceState:
         law = self.deflection
         assert law is not None  # Snell's is not among them
         return law.law.deflect(law.parameters, point, direction, normal, media, travel)
+
+    def cosine_of_incidence(self, point: Vector, direction: Vector) -> Tensor:
+        """Return the cosine of the angle between rays and the normal at points (mm), 0 to 1."""
+        normal = self.shape.normal(self.parameters, *point)
+        along = sum(d * n for d, n in zip(direction, normal, strict=True))
+        return torch.as_tensor(along).abs().clamp(max=1.0)
 
     def double(self) -> "SurfaceState":
         """Return the same surface in double precision; gradients flow back to its own tensors."""

@@ -135,7 +135,7 @@ class Toroid(Surface):
 
     def check_aperture(self) -> None:
         """Check that the clear aperture lies within the sag's branch."""
-        p = {name: value.detach() for name, value in self.named_parameters()}
+        p = {name: value.detach() for name, value in self.named_parameters(recurse=False)}
         rounding = 4.0 * torch.finfo(p["curvature_x"].dtype).eps
         share = torch.linspace(0.0, 1.0, 65).to(p["curvature_x"])
         x, y = (reach * share for reach in self.aperture.edge.extent)
