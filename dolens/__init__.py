@@ -50,6 +50,7 @@ _VIEWS = (
         "explain",
         "field_curves",
         "footprint",
+        "ghosts",
         "lateral_colour",
         "mtf",
         "photograph",

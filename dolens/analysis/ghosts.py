@@ -51,7 +51,7 @@ from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.system import OpticalSystem
 
 # Blocks of rays, whose scatter tells the error.
-_BLOCKS = 8
+BLOCKS = 8
 # The plastic number's inverse powers: steps of a lattice that covers a square evenly (Roberts,
 # 2018), whatever the number of points.
 _STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -117,7 +117,7 @@ class FrontRays:
         rays: (N,).
         weight: (N,), of a ray: the area (mm²) that it stands for where the light is as strong as at
             the first vertex.
-        block: (blocks, N), one where a ray is in a block, else zero.
+        block: (N,), int64, from 0.
         ends: (N,), int64: twice the number of the surface where the ray ends on the image's path,
             and one more where it is reflected totally; more than any where it arrives.
         image: (N,), bool: it arrives in the image.
@@ -134,9 +134,9 @@ class FrontRays:
     def of(self, path: Path) -> tuple[Rays, Tensor, Tensor]:
         """Return the rays that come to the surface that reflects first, with weights and blocks."""
         # They come first; see `front_rays`.
-        count = int((self.ends > 2 * path[0]).sum())
+        count = int(torch.searchsorted(-self.ends, -2 * path[0]))
         rays = Rays(self.rays.position[:count], self.rays.direction[:count], self.rays.wavelength)
-        return rays, self.weight[:count], self.block[:, :count]
+        return rays, self.weight[:count], self.block[:count]
 
 
 @torch.no_grad()
@@ -168,7 +168,7 @@ def ghosts(
     where = where.that_count()
     radius = 0.5 * lens.sensor_diameter if lens.sensor_diameter else math.inf
     places = {ENTERING: 0, IMAGE: 1} | {path: place for place, path in enumerate(chosen, 2)}
-    sums = torch.zeros(len(places), _BLOCKS, 6, dtype=torch.float64)
+    sums = torch.zeros(len(places), BLOCKS, 6, dtype=torch.float64)
     count = 0
     for path, points, light, block in ghost_light(lens, where, chosen, rays, sensor_reflectance):
         if path == ENTERING:
@@ -224,7 +224,7 @@ class GhostLight(NamedTuple):
         points: (N, 2), mm, where it lands on the sensor; of the first it means nothing.
         light: (N,), mm²: the area, in front of the lens, from which it comes times the share that
             passes; zero of rays that do not arrive.
-        block: (blocks, N), one where a ray is in a block, else zero.
+        block: (N,), int64, from 0: the block of the lattice.
     """
 
     path: Path
@@ -252,7 +252,7 @@ def ghost_light(
     Raises:
         InputError: more or fewer than one field, a number out of range, or no light that enters.
     """
-    check_count("rays", rays, _BLOCKS)
+    check_count("rays", rays, BLOCKS)
     if len(where.fields) != 1:
         raise InputError(f"ghosts are those of one field, not of {len(where.fields)}")
     if not 0.0 <= sensor_reflectance <= 1.0:
@@ -331,7 +331,7 @@ def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> 
     # From a near point, light falls off with the square of the distance and obliquely.
     slope = line[2] * near * q.norm(dim=-1)
     weight = float((high - low).prod()) / count * (1.0 + slope * slope) ** -1.5
-    block = (k[:, 0] * (_BLOCKS / count)).long().clamp(max=_BLOCKS - 1)
+    block = (k[:, 0] * (BLOCKS / count)).long().clamp(max=BLOCKS - 1)
     first = system.met[0]
     enters = trace_rays(system, rays, 1.0, False, 1, first).valid
     hit = trace_rays(system, rays)
@@ -342,7 +342,7 @@ def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> 
     return FrontRays(
         Rays(rays.position[kept], rays.direction[kept], wavelength),
         weight[kept],
-        (block[kept] == torch.arange(_BLOCKS).to(block)[:, None]).double(),
+        block[kept],
         ends[kept],
         hit.valid[kept],
         hit.position[kept][:, :2],
@@ -385,7 +385,9 @@ def _sums(points: Tensor, light: Tensor, block: Tensor, radius: float) -> Tensor
     x, y = points.unbind(-1)
     light = light * (x * x + y * y < radius * radius)
     lx, ly = light * x, light * y
-    return (block @ torch.stack((light, lx, ly, lx * x, lx * y, ly * y), -1)).cpu()
+    moments = (light, lx, ly, lx * x, lx * y, ly * y)
+    sums = [torch.bincount(block, moment, minlength=BLOCKS) for moment in moments]
+    return torch.stack(sums, -1).cpu()
 
 
 def _with_errors(
@@ -401,12 +403,12 @@ def _with_errors(
     """
     all_of, front = sums.sum(1), entering.sum()
     # Without one block after the other.
-    scale = _BLOCKS / (_BLOCKS - 1.0)
+    scale = BLOCKS / (BLOCKS - 1.0)
     others = scale * (all_of - sums.transpose(0, 1))
     fronts = scale * (front - entering)
     found = _measures(all_of[None], front[None], smallest)
     left = _measures(others, fronts, smallest)
-    errors = [((_BLOCKS - 1.0) / _BLOCKS * (v - v.mean(0)).square().sum(0)).sqrt() for v in left]
+    errors = [((BLOCKS - 1.0) / BLOCKS * (v - v.mean(0)).square().sum(0)).sqrt() for v in left]
     values = [v[0] for v in found]
     image, image_error = float(values[0][0]), float(errors[0][0])
     dark = values[0][1:] == 0.0

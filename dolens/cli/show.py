@@ -39,6 +39,12 @@ def show(
             help="Add the worst offenders among tolerances: of a YAML file, or usual ones.",
         ),
     ] = None,
+    ghosts: Annotated[
+        bool,
+        typer.Option(
+            "--ghosts", help="Add the ghosts of a source at each field: light reflected twice."
+        ),
+    ] = False,
     field: Annotated[
         list[str] | None,
         typer.Option(
@@ -104,7 +110,7 @@ def show(
         entrance_pupil,
     )
     console = Console(highlight=False)
-    overview = lens_overview(shown)
+    overview = lens_overview(shown, ghosts)
     console.print()
     console.print(printable(overview.name), style="bold", markup=False)
     console.print(overview.summary, style="dim", markup=False)
@@ -120,7 +126,7 @@ def show(
         for table in section.tables:
             _print_table(console, table)
     if html is not None or figures is not None:
-        _write(console, shown, html, figures, tolerances, started)
+        _write(console, shown, html, figures, tolerances, ghosts, started)
 
 
 def _field(text: str) -> tuple[float, float]:
@@ -210,6 +216,7 @@ def _write(
     html: Path | None,
     figures: Path | None,
     tolerances: str | None,
+    ghosts: bool,
     started: float,
 ) -> None:
     import shlex
@@ -240,6 +247,7 @@ def _write(
             html,
             figures=figures,
             tolerances=tolerances,
+            ghosts=ghosts,
             command=shlex.join(["dolens", *sys.argv[1:]]),
             progress=report,
         )

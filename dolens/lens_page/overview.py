@@ -11,6 +11,7 @@ from dolens.analysis.fields_and_wavelengths import as_wavelengths, field_points,
 from dolens.analysis.paraxial_data import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
+from dolens.lens_page.ghosts import ghost_tables, ghosts_of_fields
 from dolens.lens_page.tables import (
     Table,
     first_order_table,
@@ -65,11 +66,12 @@ class Overview:
 
 
 @torch.no_grad()
-def lens_overview(lens: Lens) -> Overview:
+def lens_overview(lens: Lens, ghosts: bool = False) -> Overview:
     """Compute the tables of a lens, at its own fields, wavelengths and object distance.
 
     Args:
         lens: centred or with poses, of any precision.
+        ghosts: whether to list its ghosts.
 
     Raises:
         InputError: the lens names conditions that no analysis can take.
@@ -82,14 +84,15 @@ def lens_overview(lens: Lens) -> Overview:
         return spot_radii_table(found[0])
 
     sections = [TableSection("Prescription", prescription_tables(lens))]
-    for title, make in (
+    made: list[tuple[str, Callable[[], Table | list[Table]]]] = [
         *([("States", lambda: states_table(lens))] if lens.states else []),
         ("First-order data", lambda: first_order_table(lens, where)),
         *([("Published numbers", lambda: published_table(lens, where))] if lens.published else []),
         ("Seidel sums", lambda: seidel_table(lens, where)),
         ("RMS spot radii", spots),
-    ):
-        sections.append(_section(title, make))
+        *([("Ghosts", lambda: ghost_tables(ghosts_of_fields(lens, where)))] if ghosts else []),
+    ]
+    sections += [_section(title, make) for title, make in made]
     return Overview(
         lens.name or "Lens", summary(lens, where), where, sections, found[0] if found else None
     )
@@ -125,9 +128,10 @@ def _focal_length(efl: float) -> str:
     return f"f = {number(efl)} mm" if abs(efl) < 1e9 else "afocal"
 
 
-def _section(title: str, make: Callable[[], Table]) -> TableSection:
+def _section(title: str, make: Callable[[], Table | list[Table]]) -> TableSection:
     try:
-        return TableSection(title, [make()])
+        found = make()
+        return TableSection(title, found if isinstance(found, list) else [found])
     except InputError as error:
         return TableSection(title, problems=[str(error)])
 

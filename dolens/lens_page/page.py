@@ -49,6 +49,7 @@ def write_page(
     figures: str | Path | None = None,
     command: str = "",
     progress: Progress | None = None,
+    ghosts: bool = False,
 ) -> Written:
     """Write a page about a lens: its section, its aberrations, and what a designer asks for.
 
@@ -65,6 +66,7 @@ def write_page(
 
     Rarely needed:
         progress: is called with a title, the steps done and the number of all steps.
+        ghosts: adds the ghosts of a source at each field.
 
     Tables list all fields; figures show nine of them at most, and the heading says which.
 
@@ -75,7 +77,7 @@ def write_page(
     lens = prepared_lens(lens)
     overview = lens_overview(lens)
     shown, about = _with_few_fields(lens, overview)
-    listed = PageSections(shown, about, tolerances).sections()
+    listed = PageSections(shown, about, tolerances, ghosts).sections()
     written = Written()
     blocks = _overview_blocks(overview)
     said = progress or (lambda title, done, total: None)

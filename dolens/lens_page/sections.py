@@ -16,6 +16,7 @@ from dolens.analysis.conditions import FieldScan, field_scans, spectral_lines, w
 from dolens.analysis.encircled_energy import encircled_energy
 from dolens.analysis.field_curves import DISTORTION_REFERENCES, field_curves, image_displacement
 from dolens.analysis.footprint import footprint
+from dolens.analysis.ghost_map import ghost_map
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_intercepts import aimed_at_stop, ray_fans
@@ -36,6 +37,7 @@ from dolens.diffraction.wavefront_map import (
     wavefront_maps,
 )
 from dolens.errors import InputError
+from dolens.lens_page.ghosts import ghost_tables, ghosts_of_fields
 from dolens.lens_page.in_space import HANDS
 from dolens.lens_page.markup import View, view
 from dolens.lens_page.offenders import bright_fields, offenders
@@ -51,6 +53,7 @@ from dolens.plotting.field_curves import (
     rms_curves_figure,
 )
 from dolens.plotting.footprint import footprint_figure
+from dolens.plotting.ghosts import ghost_map_figure
 from dolens.plotting.lens_section import lens_section_figure, states_layout_figure
 from dolens.plotting.modulation import modulation_comparison_figure
 from dolens.plotting.point_spread import encircled_energy_figure, point_spread_figure
@@ -103,20 +106,25 @@ class PageSections:
         lens: prepared (see `prepared_lens`).
         overview: its tables and conditions.
         tolerances: `default` or a file, for the worst offenders; None leaves them out.
+        ghosts: whether there is a section of ghosts.
     """
 
     def __init__(
-        self, lens: Lens, overview: Overview, tolerances: str | Path | None = None
+        self,
+        lens: Lens,
+        overview: Overview,
+        tolerances: str | Path | None = None,
+        ghosts: bool = False,
     ) -> None:
-        self.tolerances = tolerances
+        self.tolerances, self.with_ghosts = tolerances, ghosts
         self.lens, self.overview, self.where = lens, overview, overview.conditions
         self.distance = overview.conditions.object_distance
 
     def sections(self) -> list[Section]:
         """Return all sections in the order of the page."""
-        last = (
-            [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
-        )
+        last = [Section("ghosts", "Ghosts", self.ghosts)] if self.with_ghosts else []
+        if self.tolerances is not None:
+            last.append(Section("offenders", "Tolerances", self.offenders))
         return [
             Section("layout", "Section", self.layout),
             *([Section("states", "States", self.states)] if self.lens.states else []),
@@ -132,7 +140,7 @@ class PageSections:
             Section("light", "Relative illumination", self.light),
             Section("wavefront", "Wavefront error", self.wavefront),
             Section("footprint", "Footprints", self.footprint),
-            *(last if self.tolerances is not None else ()),
+            *last,
         ]
 
     @cached_property
@@ -273,6 +281,19 @@ class PageSections:
         )
         figure = rms_curves_figure(against_field, against_wavelength, title="")
         return Content({"rms": figure})
+
+    def ghosts(self) -> Content:
+        """Show the ghosts of a source at each field over the sensor, and the brightest of all."""
+        found = ghosts_of_fields(self.lens, self.where)
+        maps = [ghost_map(self.lens, one.found.where) for one in found]
+        brightest = max(found, key=lambda one: float(one.found.measures.irradiance[0]))
+        return Content(
+            {
+                "ghosts": ghost_map_figure(maps, None),
+                "brightest_ghost": brightest.draw(),
+            },
+            ghost_tables(found),
+        )
 
     def offenders(self) -> Content:
         """Find the worst offenders among tolerances."""

@@ -1,5 +1,6 @@
 """Tables of text cells, printed for a terminal or written as HTML for a notebook."""
 
+import math
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -59,6 +60,29 @@ def printable(text: str) -> str:
     terminal what it likes.
     """
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def measured(value: float, error: float) -> str:
+    """Return a value with the digits that its standard error allows: `12.67 ± 0.04`,
+    `(1.304 ± 0.007)e-3`.
+
+    Args:
+        value: NaN is written as a dash.
+        error: one significant digit of it is written; the value alone where it is zero, below the
+            value's rounding, or unknown.
+    """
+    if math.isnan(value):
+        return "–"
+    known = math.isfinite(error) and math.isfinite(value)
+    if not (known and error > 1e-9 * abs(value)):
+        return f"{value:.4g}"
+    size = max(abs(value), error)
+    power = 0 if 1e-3 <= size < 1e5 else math.floor(math.log10(size))
+    value, error = value / 10.0**power, error / 10.0**power
+    decimals = max(-math.floor(math.log10(float(f"{error:.0e}"))), 0)
+    # No negative zero.
+    text = f"{round(value, decimals) + 0.0:.{decimals}f} ± {error:.{decimals}f}"
+    return f"({text})e{power}" if power else text
 
 
 def minus(number: str) -> str:

@@ -354,6 +354,8 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
 
 
 def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
+    if not fans:
+        return
     lines = sorted({fan.wavelength for fan in fans})
     by_wavelength = len(lines) > 1
     keys = lines if by_wavelength else list(dict.fromkeys(fan.field for fan in fans))

@@ -10,12 +10,13 @@ The numbers behind each figure come from the functions that the methods call.
 """
 
 from dolens.views.design import DesignViews
+from dolens.views.ghosts import GhostViews
 from dolens.views.image_quality import ImageQualityViews
 from dolens.views.overview import OverviewViews
 from dolens.views.photographs import PhotographViews
 
 
-class LensViews(OverviewViews, ImageQualityViews, DesignViews, PhotographViews):
+class LensViews(OverviewViews, ImageQualityViews, GhostViews, DesignViews, PhotographViews):
     """Methods of `Lens` that show it.
 
     Arguments that all of them share:
