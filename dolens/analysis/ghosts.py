@@ -13,8 +13,10 @@ source transmittance of stray light analysis (Fest, Stray Light Analysis and Con
 The power of a ghost over that of the image is also the share of veiling light that it adds where
 all of the field is as bright.
 
-A surface reflects what bare glass does at normal incidence, R = ((n' - n)/(n' + n))², and passes
-the rest.  A source lit by no image has no power over it (NaN).
+Coatings decide, at each ray's own angles, which share of the light a surface reflects and passes,
+and glasses how much is left of it between them.  A surface without a coating counts as bare glass:
+an ideal one, as it is for all else, would make no ghosts.  Where the source has no image, nothing
+has power over it (NaN).
 
 Where rays begin is a lattice, the same in each run.  It is made of blocks, each of which covers the
 front alone; errors are standard errors by leaving out one block after the other (jackknife).
@@ -23,7 +25,6 @@ front alone; errors are standard errors by leaving out one block after the other
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -33,15 +34,14 @@ from dolens.analysis.conditions import Conditions
 from dolens.errors import InputError, check_count
 from dolens.optics.aiming import field_line, launch
 from dolens.optics.field_and_aperture import in_double_precision
+from dolens.optics.ghost_optics import GhostFirstOrder, NormalIncidence, ghosts_first_order
 from dolens.optics.ghost_paths import (
-    GhostFirstOrder,
     Path,
     check_path,
     ghost_path_systems,
     ghost_paths,
-    ghosts_first_order,
     reflecting_surfaces,
-    unfolded,
+    with_losses,
 )
 from dolens.optics.image_surface import WITHOUT_EDGE
 from dolens.optics.lens import Lens
@@ -120,15 +120,13 @@ class FrontRays:
         block: (N,), int64, from 0.
         ends: (N,), int64: twice the number of the surface where the ray ends on the image's path,
             and one more where it is reflected totally; more than any where it arrives.
-        image: (N,), bool: it arrives in the image.
-        landed: (N, 2), mm, where.
+        landed: (N, 2), mm, where it lands in the image.
     """
 
     rays: Rays
     weight: Tensor
     block: Tensor
     ends: Tensor
-    image: Tensor
     landed: Tensor
 
     def of(self, path: Path) -> tuple[Rays, Tensor, Tensor]:
@@ -178,9 +176,9 @@ def ghosts(
         lens.system(), chosen, where.reference_wavelength, where.object_distance
     )
     smallest = math.pi * first.diffraction(float(where.wavelengths.max())).square().nan_to_num()
-    passing = PassedShares(lens.system(), where.reference_wavelength, sensor_reflectance)
+    normal = NormalIncidence(lens.system(), where.reference_wavelength, sensor_reflectance)
     # Of a path without light: the share of one ray.
-    least = torch.tensor([passing.of(path) for path in chosen], dtype=torch.float64) / count
+    least = torch.stack([normal.share(path) for path in chosen]).cpu() / count
     found, errors, image = _with_errors(sums[1:], sums[0, :, 0], smallest, least)
     order = found.irradiance.argsort(descending=True, stable=True)
     return Ghosts(
@@ -217,13 +215,13 @@ IMAGE: Path = ()
 
 
 class GhostLight(NamedTuple):
-    """The light of N rays of one path and wavelength.
+    """The light of the N rays of one path and wavelength that arrive.
 
     Attributes:
         path: surfaces that reflect, or one of `ENTERING` and `IMAGE`.
         points: (N, 2), mm, where it lands on the sensor; of the first it means nothing.
         light: (N,), mm²: the area, in front of the lens, from which it comes times the share that
-            passes; zero of rays that do not arrive.
+            is left.
         block: (N,), int64, from 0: the block of the lattice.
     """
 
@@ -257,53 +255,38 @@ def ghost_light(
         raise InputError(f"ghosts are those of one field, not of {len(where.fields)}")
     if not 0.0 <= sensor_reflectance <= 1.0:
         raise InputError(f"sensor_reflectance: {sensor_reflectance}; allowed: 0 to 1")
-    system, catching = lens.system(), sensor_aperture(lens)
+    system, catching = with_losses(lens.system()), sensor_aperture(lens)
+    sensor = len(system.surfaces) + 1
     for wave, share in zip(where.wavelengths.tolist(), where.weights.tolist(), strict=True):
         front = front_rays(lens, where, wave, rays)
         if not len(front.weight):
             field = tuple(where.fields[0].tolist())
             raise InputError(f"ghosts: no light of field {field} enters the front surface")
-        passing = PassedShares(system, wave, sensor_reflectance)
         yield GhostLight(ENTERING, front.landed, share * front.weight, front.block)
-        light = share * passing.of(IMAGE) * front.weight * front.image
-        yield GhostLight(IMAGE, front.landed, light, front.block)
+        yield _arriving(IMAGE, system, front.rays, share * front.weight, front.block)
         for path, ghost in zip(paths, ghost_path_systems(system, paths, catching), strict=True):
             beam, weight, block = front.of(path)
             if len(weight):
-                hit = trace_rays(ghost, beam)
-                light = share * passing.of(path) * (weight * hit.valid)
-                yield GhostLight(path, hit.position[:, :2], light, block)
+                left = share * sensor_reflectance ** path.count(sensor)
+                yield _arriving(path, ghost, beam, left * weight, block)
+
+
+def _arriving(
+    path: Path, system: OpticalSystem, rays: Rays, weight: Tensor, block: Tensor
+) -> GhostLight:
+    """Trace rays of a path, those that arrive also with the share of light that is left."""
+    hit = trace_rays(system, rays)
+    kept = torch.nonzero(hit.valid)[:, 0]
+    beam = Rays(rays.position[kept], rays.direction[kept], rays.wavelength)
+    passed = trace_rays(system, beam, transmission=True).transmission
+    assert passed is not None  # it was asked for
+    return GhostLight(path, hit.position[kept, :2], weight[kept] * passed, block[kept])
 
 
 def sensor_aperture(lens: Lens) -> ClearAperture:
     """Return what a sensor catches: a circle where the lens names its diameter."""
     diameter = lens.sensor_diameter
     return ClearAperture(Circle(0.5 * diameter)) if diameter else WITHOUT_EDGE
-
-
-class PassedShares:
-    """Gives the share of light that passes along a path, by bare glass at normal incidence.
-
-    Args:
-        system: the lens.
-        wavelength: nm.
-        sensor_reflectance: share that the sensor reflects.
-    """
-
-    def __init__(
-        self, system: OpticalSystem, wavelength: float, sensor_reflectance: float = 0.0
-    ) -> None:
-        indices = [float(index) for index in system.indices(wavelength)]
-        self.reflected = [((one - other) / (one + other)) ** 2 for one, other in pairwise(indices)]
-        self.reflected.append(sensor_reflectance)
-
-    def of(self, path: Path) -> float:
-        """Return the share of a path; () is that of the image."""
-        way, found = unfolded(path, len(self.reflected) - 1), 1.0
-        for place, number in enumerate(way.numbers):
-            share = self.reflected[number - 1]
-            found *= share if place in way.bounces else 1.0 - share
-        return found
 
 
 def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> FrontRays:
@@ -344,7 +327,6 @@ def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> 
         weight[kept],
         block[kept],
         ends[kept],
-        hit.valid[kept],
         hit.position[kept][:, :2],
     )
 

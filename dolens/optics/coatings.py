@@ -173,7 +173,7 @@ class Table(CoatingState):
         """Return the shares, interpolated; beyond the last angle those of the last."""
         if self.turned:
             # Snell's law gives the angle on the table's side.
-            sine2 = (front / behind) ** 2 * (1.0 - cosine.square())
+            sine2 = (front / self.behind(behind, wavelength)) ** 2 * (1.0 - cosine.square())
             cosine = (1.0 - sine2).clamp(min=1e-12).sqrt()
         angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0 + 1e-12, 1.0 - 1e-12)))
         angle = angle.clamp(max=self.angles[-1])

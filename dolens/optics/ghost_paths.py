@@ -9,19 +9,17 @@ Unfolded, a path is a sequence of surfaces as any other lens with mirrors, and a
 lenses can be done with it (Abd El-Maksoud and Sasián, Proc. SPIE 7428, 742807, 2009).
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
 from dolens.errors import InputError
+from dolens.optics.coatings import Stack
 from dolens.optics.elements import ElementState
 from dolens.optics.image_surface import WITHOUT_EDGE
-from dolens.optics.paraxial import behind_surfaces, curvatures_of, first_order, powers_of, vergence
+from dolens.optics.materials import Medium
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak, TiltFirstBreak
@@ -32,8 +30,6 @@ from dolens.optics.system import OpticalSystem
 Path = tuple[int, ...]
 # Paths of many reflections are too many to count.
 _MOST_BOUNCES = 6
-# First zero of Bessel's J₁ over 2π.
-_AIRY = 0.6098349456332723
 
 
 def reflecting_surfaces(system: OpticalSystem, sensor: bool = False) -> tuple[int, ...]:
@@ -168,8 +164,9 @@ def ghost_path_system(
     """Return a path as a sequence of surfaces.
 
     It holds the tensors of the lens, so that gradients flow to them: shapes, gaps with their signs,
-    poses of elements, index offsets.  Light passes an aperture as often as it comes to it.  Mirrors
-    of the lens reflect in either direction, and a coordinate break on the way back is undone.
+    poses of elements, index offsets, coatings.  Light passes an aperture as often as it comes to
+    it.  Mirrors of the lens reflect in either direction, and a coordinate break on the way back is
+    undone.
 
     Path lengths through ideal lenses are those of the image's beam.
 
@@ -198,9 +195,17 @@ def ghost_path_systems(
     onto_sensor = system.image
     if onto_sensor is None:
         onto_sensor = SurfaceState(Plane, {}, sensor)
-    surfaces = [*system.surfaces, replace(onto_sensor, aperture=sensor)]
-    # The same for all paths; on the way back, what a break did is undone.
-    back = [_undone(surface) if surface.shape.changes_axes else surface for surface in surfaces]
+    of_lens = [*system.surfaces, replace(onto_sensor, aperture=sensor)]
+
+    @cache
+    def met(number: int, onward: bool, bounces: bool) -> SurfaceState:
+        """Return a surface as light comes to it; the same for all paths."""
+        mirror = number in system.mirrors
+        other = None
+        if bounces and number <= len(system.surfaces):
+            other = system.materials[number if onward else number - 1]
+        return _as_met(of_lens[number - 1], onward or mirror, other)
+
     gaps = [*system.thicknesses, system.sensor_distance]
     negative = [-gap for gap in gaps]
     # An inner element comes before the one that holds it, also where both have one surface.
@@ -212,8 +217,7 @@ def ghost_path_systems(
         yield replace(
             system,
             surfaces=[
-                (surfaces if onward else back)[number - 1]
-                for number, onward in zip(numbers, way.onwards, strict=True)
+                met(number, way.onwards[place], place in way.bounces) for place, number in turned
             ],
             thicknesses=way.between(gaps, negative),
             materials=[system.materials[medium] for medium in way.media],
@@ -241,6 +245,36 @@ def _runs(element: ElementState, numbers: Sequence[int]) -> Iterator[ElementStat
             begin = None
 
 
+def _as_met(surface: SurfaceState, onward: bool, other: Medium | None) -> SurfaceState:
+    """Return a surface as light comes to it.
+
+    Args:
+        surface: as the lens has it.
+        onward: whether light comes on the way to the sensor, or to a mirror.
+        other: the medium on the far side of a surface that reflects a part of the light.
+    """
+    if surface.shape.changes_axes:
+        return surface if onward else _undone(surface)
+    coating = surface.coating
+    if coating is not None:
+        coating = coating if onward else coating.turned_round()
+        coating = coating if other is None else replace(coating, substrate=other)
+    return surface if coating is surface.coating else replace(surface, coating=coating)
+
+
+def with_losses(system: OpticalSystem) -> OpticalSystem:
+    """Return the lens with bare glass where a surface has no coating: an ideal one, which passes
+    all light, makes no ghosts.
+    """
+    surfaces = [
+        replace(surface, coating=Stack())
+        if surface.coating is None and _reflects(system, number)
+        else surface
+        for number, surface in enumerate(system.surfaces, 1)
+    ]
+    return replace(system, surfaces=surfaces)
+
+
 def _undone(surface: SurfaceState) -> SurfaceState:
     """Return the coordinate break that undoes another one.
 
@@ -259,98 +293,3 @@ def _undone(surface: SurfaceState) -> SurfaceState:
         )
     parameters = {name: -value for name, value in surface.parameters.items()}
     return replace(surface, shape=shape, parameters=parameters)
-
-
-class GhostFirstOrder(NamedTuple):
-    """First-order optics of P unfolded paths, each number (P,), mm; infinite where there is none.
-
-    Attributes:
-        focus: from the sensor to where an axial beam is focused; negative in front of it.
-        efl: effective focal length of the path.
-        marginal: height at the sensor of the marginal ray of the lens's axial beam.
-        pupil: from the sensor to the image of the stop, as its first pass is seen from behind.
-        slope: of the marginal ray at the sensor.
-    """
-
-    focus: Tensor
-    efl: Tensor
-    marginal: Tensor
-    pupil: Tensor
-    slope: Tensor
-
-    def diffraction(self, wavelength: float) -> Tensor:
-        """Return the radius (mm) by which diffraction at the image of the stop spreads the light,
-        to the first zero: Airy's where the sensor is in the focus.
-
-        Args:
-            wavelength: nm.
-        """
-        # Of the pupil's rim as seen from the sensor; of the beam, where the pupil is at infinity.
-        tangent = self.marginal / self.pupil + self.slope
-        return _AIRY * wavelength * 1e-6 / tangent.abs()
-
-
-def ghosts_first_order(
-    system: OpticalSystem,
-    paths: Sequence[Path],
-    wavelength: float,
-    object_distance: float | None = None,
-) -> GhostFirstOrder:
-    """Return first-order optics of unfolded paths, without gradients.
-
-    Numbers of Python's take a hundredth of the time that `first_order` of a path's system takes,
-    which gives the same with gradients.
-
-    Args:
-        system: the lens.
-        paths: as `ghost_paths` gives them.
-        wavelength: nm.
-        object_distance: mm in front of the first vertex; None for an object at infinity.
-    """
-    curvatures, gaps, indices = (
-        [float(value) for value in values]
-        for values in (
-            [*curvatures_of(system), 0.0 if system.image is None else _curvature(system)],
-            [*system.thicknesses, system.sensor_distance],
-            system.indices(wavelength),
-        )
-    )
-    powers = powers_of(system, wavelength)
-    added = [0.0] * len(curvatures) if powers is None else [*map(float, powers), 0.0]
-    first = first_order(system, wavelength, object_distance)
-    near = indices[0] * float(vergence(object_distance))
-    pupil = first.entrance_pupil
-    height = 0.5 * float(pupil.diameter)
-    if near:
-        # From the axial object point to the rim of the pupil.
-        height /= 1.0 + float(pupil.z) * float(vergence(object_distance))
-    rows = []
-    negative = [-gap for gap in gaps]
-    for path, ghost in zip(paths, ghost_path_systems(system, paths), strict=True):
-        way = unfolded(path, len(system.surfaces))
-        n = [s * indices[medium] for s, medium in zip(ghost.senses, way.media, strict=True)]
-        c = [curvatures[number - 1] for number in way.numbers]
-        t = way.between(gaps, negative)
-        # A surface that reflects does not deflect by its law.
-        p = [0.0 if i in way.bounces else added[m - 1] for i, m in enumerate(way.numbers)]
-        a, b, low, d = behind_surfaces(c, t, n, p)
-        behind, distance = n[-1], gaps[-1]
-        y, nu = height * (a + b * near), height * (low + d * near)
-        stop = ghost.stop - 1
-        _, b_stop, _, d_stop = behind_surfaces(c[stop:], t[stop:], n[stop:], p[stop:])
-        rows.append(
-            (
-                math.inf if nu == 0.0 else -behind * y / nu - distance,
-                math.inf if low == 0.0 else -1.0 / low,
-                y + nu / behind * distance,
-                math.inf if d_stop == 0.0 else -behind * b_stop / d_stop - distance,
-                nu / behind,
-            )
-        )
-    found = torch.tensor(rows, dtype=torch.float64)
-    return GhostFirstOrder(*found.unbind(-1))
-
-
-def _curvature(system: OpticalSystem) -> Any:
-    assert system.image is not None  # the caller looked
-    return system.image.parameters["curvature"]

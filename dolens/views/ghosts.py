@@ -27,7 +27,7 @@ _WORDS = (0, len(HEADINGS) - 1)
 NOTE = (
     "Power over that of the image; irradiance, the mean on the ghost, over that of the light in "
     "front of the lens (point source transmittance).  Focus and image of the stop count from the "
-    "sensor.  Bare glass, at normal incidence.  ± standard errors."
+    "sensor.  Surfaces without a coating count as bare glass.  ± standard errors."
 )
 # Rows of a table that shows itself.
 _MOST = 20

@@ -1,5 +1,6 @@
 """Ghosts of a source: plates and balls in closed form, first order beside tensors, errors."""
 
+import cmath
 import math
 
 import pytest
@@ -7,10 +8,13 @@ import torch
 
 from dolens import InputError, load_lens
 from dolens.analysis.conditions import conditions
-from dolens.analysis.ghosts import PassedShares, ghosts
-from dolens.optics.ghost_paths import ghost_path_system, ghost_paths, ghosts_first_order
+from dolens.analysis.ghosts import ghosts
+from dolens.optics.ghost_optics import NormalIncidence, ghosts_first_order
+from dolens.optics.ghost_paths import ghost_path_system, ghost_paths
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_rays import paraxial_rays
+from dolens.prescriptions import lens_from_prescription, prescription_of
+from dolens.prescriptions.coatings import coated
 from tests.lenses import lens_of_rows
 
 GLASS = 1.5
@@ -28,6 +32,15 @@ def plate(front=5.0, **keys):
     )
 
 
+def reflected(angle):
+    """Fresnel's share of unpolarised light that glass reflects, at an angle in air in degrees."""
+    one = math.radians(angle)
+    other = math.asin(math.sin(one) / GLASS)
+    s = (math.sin(one - other) / math.sin(one + other)) ** 2
+    p = (math.tan(one - other) / math.tan(one + other)) ** 2
+    return 0.5 * (s + p)
+
+
 def found(lens, field=0.0, distance=None, wavelengths=None, **settings):
     where = conditions(lens, field, wavelengths or lens.primary_wavelength, distance)
     return ghosts(lens, where, **settings)
@@ -35,19 +48,81 @@ def found(lens, field=0.0, distance=None, wavelengths=None, **settings):
 
 def test_all_orders_of_a_plate_have_the_power_of_the_incoherent_sum():
     """T = (1 - R)/(1 + R), of which reflections beyond the sixth have R⁸."""
-    orders = [found(plate(), 10.0, rays=200, bounces=b) for b in (2, 4, 6)]
+    orders = [found(plate(), 30.0, rays=200, bounces=b) for b in (2, 4, 6)]
     total = orders[0].image + sum(float(g.measures.share.sum()) for g in orders)
-    assert math.isclose(orders[0].image, (1.0 - R) ** 2, rel_tol=1e-14)
-    assert math.isclose(total, (1.0 - R) / (1.0 + R) * (1.0 - R**8), rel_tol=1e-12)
+    r = reflected(30.0)
+    assert math.isclose(orders[0].image, (1.0 - r) ** 2, rel_tol=1e-13)
+    assert math.isclose(total, (1.0 - r) / (1.0 + r) * (1.0 - r**8), rel_tol=1e-12)
     for order, one in enumerate(orders, 1):
-        assert math.isclose(one.total, R ** (2 * order), rel_tol=1e-12)
+        assert math.isclose(one.total, r ** (2 * order), rel_tol=1e-12)
+
+
+def film(front, behind, n, k, thickness, wavelength):
+    """R and T at normal incidence of a film, by its characteristic matrix (Macleod, ch. 2)."""
+    index = complex(n, -k)
+    delta = 2.0 * math.pi * index * thickness / wavelength
+    cosine, sine = cmath.cos(delta), 1j * cmath.sin(delta)
+    b, c = cosine + sine / index * behind, index * sine + cosine * behind
+    r = (front * b - c) / (front * b + c)
+    return abs(r) ** 2, 4.0 * front * behind / abs(front * b + c) ** 2
+
+
+def test_an_absorbing_film_reflects_more_on_one_side_than_on_the_other():
+    """A film of chromium on both faces of a plate: the path's light is reflected from within."""
+    n, k, thickness, wavelength = 3.1, 3.3, 3.0, 587.5618
+    layers = [{"material": [n, k], "thickness": thickness}]
+    given = prescription_of(plate())
+    for number in ("2", "3"):
+        given["surfaces"][number]["coating"] = layers
+    lens = lens_from_prescription(given)
+    one = found(lens, rays=200)
+    r, t = film(GLASS, 1.0, n, k, thickness, wavelength)
+    outside, through = film(1.0, GLASS, n, k, thickness, wavelength)
+    assert abs(outside - r) > 0.05 and math.isclose(through, t)
+    assert math.isclose(one.image, t * t, rel_tol=1e-10)
+    assert math.isclose(float(one.measures.share[0]), (t * r) ** 2, rel_tol=1e-10)
+    normal = NormalIncidence(lens.requires_grad_(False).system(), wavelength)
+    assert math.isclose(float(normal.share((3, 2))), (t * r) ** 2, rel_tol=1e-10)
+
+
+def test_a_table_of_a_coating_is_read_at_the_angle_in_front_of_it():
+    """In air at the first face, whichever side the light comes from, and in glass at the second."""
+    rows = [[587.5618, angle, *(2 * [1e-3 * angle]), *(2 * [1.0 - 1e-3 * angle])]
+            for angle in range(0, 90, 1)]  # fmt: skip
+    given = prescription_of(plate())
+    for number in ("2", "3"):
+        given["surfaces"][number]["coating"] = {"table": rows}
+    one = found(lens_from_prescription(given), 30.0, rays=200)
+    second = 1e-3 * math.degrees(math.asin(0.5 / GLASS))
+    wanted = (1.0 - 0.03) * second * 0.03 * (1.0 - second)
+    assert math.isclose(float(one.measures.share[0]), wanted, rel_tol=1e-9)
+
+
+def test_a_quarter_wave_takes_ghosts_away():
+    lens = load_lens("cooke_triplet")
+    lenses = lens, coated(lens, "quarter_wave")
+    bare, better = (found(one, 14.0, rays=1000) for one in lenses)
+    # The square of what MgF2 on glass of 1.62 takes of R, a factor of 9.
+    assert 40.0 < bare.total / better.total < 90.0
+    assert better.image > 1.2 * bare.image
+
+
+def test_glass_that_absorbs_takes_more_of_a_ghost_than_of_the_image(monkeypatch):
+    """A ghost of a plate goes through it three times."""
+    per_mm = {str(GLASS): 0.02}
+    monkeypatch.setattr(
+        "dolens.optics.system.absorption", lambda medium, nm: per_mm.get(medium.name, 0.0)
+    )
+    one = found(plate(), rays=100)
+    assert math.isclose(one.total, R * R * math.exp(-2.0 * 0.02 * 4.0), rel_tol=1e-12)
 
 
 def test_a_plate_s_ghost_is_as_large_as_its_beam():
     """A disc of the front's radius: its RMS radius, and the irradiance that falls on it."""
     one = found(plate(), 20.0)
+    r = reflected(20.0)
     share, error = (float(v.irradiance[0]) for v in (one.measures, one.errors))
-    wanted = ((1.0 - R) * R) ** 2 * math.cos(math.radians(20.0))
+    wanted = ((1.0 - r) * r) ** 2 * math.cos(math.radians(20.0))
     assert abs(share - wanted) < 3.0 * error < 1e-2 * wanted
     rms, error = (float(v.rms[0]) for v in (one.measures, one.errors))
     assert abs(rms - 5.0 / math.sqrt(2.0)) < 3.0 * error < 0.1
@@ -153,9 +228,9 @@ def test_the_sensor_s_ghosts_have_the_power_that_it_reflects():
 
 
 def test_shares_of_a_path_are_those_of_bare_glass():
-    passing = PassedShares(plate().system(), 587.5618)
-    assert math.isclose(passing.of(()), (1.0 - R) ** 2)
-    assert math.isclose(passing.of((3, 2)), ((1.0 - R) * R) ** 2)
+    normal = NormalIncidence(plate().system(), 587.5618)
+    assert math.isclose(float(normal.share(())), (1.0 - R) ** 2)
+    assert math.isclose(float(normal.share((3, 2))), ((1.0 - R) * R) ** 2)
 
 
 def test_colours_count_by_their_weights():
