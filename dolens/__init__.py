@@ -45,6 +45,7 @@ _PACKAGES = (
 )
 _VIEWS = (
     *(
+        "coated",
         "draw",
         "encircled_energy",
         "explain",
@@ -60,6 +61,7 @@ _VIEWS = (
         "optimize",
         "ray_fans",
         "relative_illumination",
+        "transmission",
         "rms",
         "spots",
         "strehl",

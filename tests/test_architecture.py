@@ -43,7 +43,16 @@ ALLOWED = {
         *("sensor", "rendering"),
     },
     "views": {
-        *("errors", "optics", "sensor", "analysis", "diffraction", "rendering", "plotting"),
+        *(
+            "errors",
+            "optics",
+            "sensor",
+            "analysis",
+            "diffraction",
+            "rendering",
+            "plotting",
+            "prescriptions",
+        ),
         "optimize",
     },
     # A page about a lens shows what all of these find out.

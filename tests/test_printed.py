@@ -294,6 +294,7 @@ def a_design(keys, name="cooke_triplet"):
 
 # The first line of a fragment of YAML, and what takes it.
 FRAGMENTS = {
+    "docs/coatings.md: coating: quarter_wave": a_lens,
     "docs/conventions.md: '3': {type: coordinate_break": a_lens,
     "docs/glass.md: temperature: 60": a_lens,
     "docs/glass.md: surfaces:": a_lens,

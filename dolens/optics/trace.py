@@ -32,6 +32,13 @@ class Margins(NamedTuple):
     transmitted: Tensor | None
 
 
+class Shares(NamedTuple):
+    """Light is lost on the way to a surface and at it: the shares that are left, tensors or 1."""
+
+    medium: Tensor | float
+    surface: Tensor | float
+
+
 @dataclass(frozen=True)
 class Trace:
     """Rays after the last surface (or on the sensor), as components.
@@ -43,7 +50,8 @@ class Trace:
         valid: bool.
         margins: per surface met.
         path_length: Σ n·t in mm, or None when it was not asked for.
-        transmission: the share of unpolarised light that arrives, or None.
+        shares: of unpolarised light, per surface met and then on the way to the sensor; None where
+            they were not asked for.
         points: per surface met, x, y, z in the lens's axes; empty when not recorded.  At a
             coordinate break it is where the ray crosses the plane z = 0 behind it.
         local: the rays on the last surface met, in its axes.
@@ -54,7 +62,7 @@ class Trace:
     valid: Tensor
     margins: list[Margins]
     path_length: Tensor | None
-    transmission: Tensor | None
+    shares: list[Shares] | None
     points: list[tuple[Tensor, Tensor, Tensor]]
     local: Components
     axes: Axes
@@ -191,7 +199,7 @@ def trace_surfaces(
         record: whether to keep the intersections.
         first: number of the first surface, from 1, as the prescription counts in either sense.
         last: number of the last surface; None: of the lens.
-        transmission: whether to multiply the shares of light that each surface and medium passes.
+        transmission: whether to find the shares of light that each surface and medium passes.
 
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
@@ -199,7 +207,7 @@ def trace_surfaces(
     indices, places, senses = system.indices(wavelength), system.axes, system.senses
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
-    passed = torch.ones_like(ray.n) if transmission else None
+    shares: list[Shares] | None = [] if transmission else None
     absorptions = system.absorptions(wavelength) if transmission else []
     forward = sense > 0.0
     margins: list[Margins] = []
@@ -228,14 +236,15 @@ def trace_surfaces(
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
         if record:
             points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
-        if passed is not None:
+        if shares is not None:
             distance = to_plane + t if carried is None else carried + to_plane + t
-            passed = passed * _within(absorptions[front], distance)
+            passes: Tensor | float = 1.0
             if surface.coating is not None:
-                passed = passed * surface_share(
+                passes = surface_share(
                     surface, (x, y, z), (l, m, n), (before, after), wavelength,
                     number in system.mirrors, forward,
                 )  # fmt: skip
+            shares.append(Shares(_within(absorptions[front], distance), passes))
         transmitted = None
         if surface.deflection is not None:
             media = Media(before, after, per_radian(wavelength, ray.n))
@@ -251,7 +260,7 @@ def trace_surfaces(
         margins.append(Margins(number, met, inside, transmitted))
         ray = Components(x, y, z, l, m, n)
     valid = _all_positive(margins, ray.n)
-    return Trace(to_lens_axes(ray, axes), valid, margins, path, passed, points, ray, axes)
+    return Trace(to_lens_axes(ray, axes), valid, margins, path, shares, points, ray, axes)
 
 
 def _within(absorption: float | Tensor, distance: Tensor) -> Tensor | float:
@@ -321,14 +330,14 @@ def trace_to_sensor(system: OpticalSystem, traced: Trace, wavelength: float | Te
     else:
         distance, towards = distance_to_plane(traced.ray, z, system.senses[-1])
         ray = transfer(traced.ray, distance)
-    path, passed = traced.path_length, traced.transmission
+    path, shares = traced.path_length, traced.shares
     if path is not None:
         path = path + system.indices(wavelength)[-1] * distance
-    if passed is not None:
-        passed = passed * _within(system.absorptions(wavelength)[-1], distance)
+    if shares is not None:
+        shares = [*shares, Shares(_within(system.absorptions(wavelength)[-1], distance), 1.0)]
     return replace(
         traced,
-        transmission=passed,
+        shares=shares,
         ray=ray,
         valid=traced.valid & (towards > 0.0),
         margins=[*traced.margins, Margins(len(system.surfaces) + 1, towards, None, None)],
@@ -390,8 +399,11 @@ def traced_rays(traced: Trace, path_before: Tensor | None) -> TracedRays:
                 for point in traced.points
             ]
         )
-    passed = traced.transmission
-    if passed is not None:
+    passed = None
+    if traced.shares is not None:
+        passed = torch.ones_like(traced.ray.x)
+        for medium, surface_passes in traced.shares:
+            passed = passed * medium * surface_passes
         passed = stop_gradient_where_invalid(passed, traced.valid)
     return TracedRays(
         transmission=passed,

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from functools import cached_property
-from typing import Any
+from pkgutil import resolve_name
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.optics.aiming import aim
+from dolens.optics.aiming import AimedRays, aim
 from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
@@ -89,7 +90,12 @@ class LensProperties:
             self._chief_rays[field] = self._traced_chief_ray(field)
         return self._chief_rays[field]
 
-    def _traced_chief_ray(self, field: tuple[float, float]) -> Components:
+    def aimed_chief_ray(self, field: tuple[float, float]) -> AimedRays:
+        """Return the real chief ray of a field in front of the lens.
+
+        Raises:
+            UnreachableField: it does not reach the stop.
+        """
         system = self.system
         options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
         angles = torch.tensor(field, **options)
@@ -101,6 +107,10 @@ class LensProperties:
         if not bool(aimed.converged):
             raise UnreachableField(field)
         self.crossings[field] = aimed.crossing
+        return aimed
+
+    def _traced_chief_ray(self, field: tuple[float, float]) -> Components:
+        system, aimed = self.system, self.aimed_chief_ray(field)
         ray, _ = enter_lens(system, aimed, 1, 1.0)
         traced = trace_surfaces(system, ray, self.wavelength, 1.0)
         return trace_to_sensor(system, traced, self.wavelength).ray
@@ -113,6 +123,7 @@ class Operand:
     A subclass with another `values` is a new operand; `_target_` names it in a configuration.
 
     Attributes:
+        keys: names of what a subclass has beside the following.
         kind: a name in `KINDS`; of a subclass, its label.
         target: what the property should be; None where only limits are given.
         min: the least that costs nothing; None for no limit.
@@ -127,6 +138,7 @@ class Operand:
             is not positive; or a field that is not x and y.
     """
 
+    keys: ClassVar[tuple[str, ...]] = ()
     kind: str
     target: float | None = None
     min: float | None = None
@@ -153,6 +165,9 @@ class Operand:
             )
         if len(self.field) != 2:
             raise InputError(f"{where}: field is x and y, not {self.field}")
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where a lens has no such property."""
 
     def values(self, lens: LensProperties) -> dict[str, Tensor]:
         """Return label → value, a scalar with a graph, in the property's own unit."""
@@ -184,8 +199,9 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     if not isinstance(settings, Mapping):
         raise InputError(f"operand {settings!r}: allowed: a mapping with its kind")
     kind = str(settings.get("kind"))
-    check_choice(kind, KINDS, "operand: kind")
-    check_keys(settings, _KEYS, f"operand '{kind}'")
+    check_choice(kind, (*KINDS, *CLASSES), "operand: kind")
+    own: type[Operand] = resolve_name(CLASSES[kind]) if kind in CLASSES else Operand
+    check_keys(settings, (*_KEYS, *own.keys), f"operand '{kind}'")
     target, low, high = (
         None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
         for key in ("target", "min", "max")
@@ -206,7 +222,10 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         states = (states,) if isinstance(states, str) else tuple(map(str, states))
         for state in states:
             check_state(lens, state)
-    return Operand(kind, target, low, high, weight, (field[0], field[1]), gaps, states)
+    more = {key: settings[key] for key in own.keys if settings.get(key) is not None}
+    found = own(kind, target, low, high, weight, (field[0], field[1]), gaps, states, **more)
+    found.check(lens)
+    return found
 
 
 def check_angles(
@@ -340,6 +359,11 @@ def _labelled(operand: Operand) -> str:
     return f"{operand.kind}/{x:g},{y:g}"
 
 
+# Kinds with more settings: their classes, loaded when one is asked for.
+CLASSES = {
+    "reflectance": "dolens.optimize.light_operands.Reflectance",
+    "transmission": "dolens.optimize.light_operands.TransmissionOfChiefRay",
+}
 # Each gives label → value of an operand: mm, degrees or per cent.
 KINDS: dict[str, Callable[[Operand, LensProperties], dict[str, Tensor]]] = {
     "efl": _first_order("efl"),

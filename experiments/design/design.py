@@ -91,6 +91,7 @@ class DesignModule(Experiment):
         "rms_spot_um/published_refocused",
         "rms_spot_um/*/*",
         "light/*",
+        "transmission/*",
         "train/merit",
         "train/*",
         "val/merit",
@@ -412,6 +413,7 @@ class DesignModule(Experiment):
                 self.mtf_max_frequency,
                 unit,
                 self.initial_merit,
+                self._others(),
             )
         found = state_figures(self.lens, self._others(), self.evaluation, self.mtf_max_frequency)
         return {**found, **history_figures(self.lens, self.history, self.initial_merit, unit)}

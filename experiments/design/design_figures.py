@@ -39,6 +39,7 @@ from dolens.plotting.field_curves import states_field_curves_figure
 from dolens.plotting.layout import optics_text, shown_name
 from dolens.plotting.lens_section import states_layout_figure
 from dolens.plotting.style import number_text
+from dolens.plotting.transmission import reflectance_figure
 
 _FREQUENCIES = 201
 # Along each diameter of the stop.
@@ -57,6 +58,7 @@ def design_figures(
     max_frequency: float | None = None,
     merit_unit: str = "",
     initial_merit: float = math.nan,
+    others: Mapping[str, Lens] | None = None,
 ) -> Figures:
     """Return the layout, spots, ray fans, MTF and RMS curves of a design, and its history.
 
@@ -72,6 +74,7 @@ def design_figures(
             less, where the spots of the design leave no contrast.
         merit_unit: of the merit function, for the history; empty where it has none.
         initial_merit: before the first iteration; NaN where it is not known.
+        others: lenses that the design is compared with, whose coatings are drawn beside its own.
     """
     where = settings.conditions_of(lens)
     fields, waves = [tuple(field) for field in where.fields.tolist()], where.wavelengths.tolist()
@@ -152,7 +155,15 @@ def design_figures(
         "modulation": transfer,
         "rms_curves": curves,
     }
+    coated = {n: one for n, one in {**(others or {}), "final": lens}.items() if _is_coated(one)}
+    if coated:
+        title = f"{shown_name(lens)}: what the coatings reflect"
+        figures["reflectance"] = lambda: reflectance_figure(coated, title)
     return figures | history_figures(lens, history, initial_merit, merit_unit)
+
+
+def _is_coated(lens: Lens) -> bool:
+    return any(surface.coating is not None for surface in lens.surfaces.values())
 
 
 def history_figures(

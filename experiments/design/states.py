@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.analysis.transmission import transmission
 from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
@@ -76,6 +77,9 @@ def spot_metrics(
         numbers[f"light/{name}"] = table.light
     for label, radius in final.radii.items():
         numbers[f"rms_spot_um/final/{label}"] = radius
+    for name, one in {**others, "final": lens}.items():
+        if any(surface.coating is not None for surface in one.surfaces.values()):
+            numbers |= light_metrics(name, one, settings)
     numbers["error/sampling_um"] = abs(spot_table(lens, settings, finer=True).mean - final.mean)
     logger.info(
         "RMS spot radius, mean of %d: %s µm",
@@ -83,6 +87,16 @@ def spot_metrics(
         ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
     )
     return numbers
+
+
+@torch.no_grad()
+def light_metrics(name: str, lens: Lens, settings: MeritSettings) -> dict[str, float]:
+    """Return what of the light passes a coated lens, the mean over fields and wavelengths."""
+    where = settings.conditions_of(lens)
+    found = transmission(lens, where)
+    share = float(where.field_weights @ found.polychromatic)
+    logger.info("Transmission, %s: %.3f %%", name, 100.0 * share)
+    return {f"transmission/{name}": share}
 
 
 def _doubled(settings: MeritSettings) -> dict[str, Any]:

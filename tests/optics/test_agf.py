@@ -172,7 +172,7 @@ def test_transmittance_by_beer_s_law():
     assert passed[1] == pytest.approx(middle, rel=1e-14)
     several = torch.tensor([400.0, 350.0, 450.0], dtype=torch.float64)
     assert glass.absorption(several).tolist() == [glass.absorption(float(w)) for w in several]
-    # The catalogue says nothing of 450 nm: the glass is clear there, and says that it does not know.
+    # The catalogue says nothing of 450 nm: the glass is clear there, and says so.
     assert glass.absorption(450.0) == 0.0
     assert [glass.knows_absorption(nm) for nm in (400.0, 450.0)] == [True, False]
 

@@ -45,8 +45,8 @@ KEYS = (
     "elements", "states", "stop", "sensor", "fields", "f_number", "wavelengths", "temperature",
     "pressure", "object_distance", "published", "object_material", "telecentric_object",
     "object_na", "real_pupil", "note", "tilt_x", "decenter_y", "coefficients", "norm_radius",
-    "order", "focal_length", "coating", "thermal_expansion", "1", "2", "0", "-1", "01", "1.0", "٣", "", " ",
-    "\x1b", "k" * 2000, "__class__", "temperature_radians",
+    "order", "focal_length", "coating", "thermal_expansion", "1", "2", "0", "-1", "01", "1.0", "٣",
+    "", " ", "\x1b", "k" * 2000, "__class__", "temperature_radians",
 )  # fmt: skip
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?")
 _WORD = re.compile(rb"[^\s,:\[\]{}\"']+")

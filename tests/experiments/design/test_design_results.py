@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from dolens import load_lens
 from dolens.optimize import MeritSettings
+from dolens.plotting.transmission import mean_reflectance
 from tests.experiments.tiny_experiment import ONE_EPOCH, QUIET, UNPICTURED
 from tests.optics import exact
 
@@ -99,3 +101,18 @@ def test_white_light_keeps_the_focal_length(trained):
     assert found.objective < found.metrics["rms_spot_um/published"]
     row = found.table("operands")[0]
     assert row["operand"] == "efl" and float(row["value"]) == pytest.approx(39.81, abs=1e-3)
+
+
+def test_four_layers_reflect_less_than_the_best_textbook_coating(trained):
+    """Means over a finer grid than the design saw."""
+    found = trained("experiment=coating", "trainer.max_epochs=1", *SHOWN)
+    waves = torch.linspace(400.0, 700.0, 61, dtype=torch.float64)
+    means = {
+        name: sum(float(mean_reflectance(lens, waves, angle).mean()) for angle in (0, 10, 20, 30))
+        / 4
+        for name, lens in (("own", found.lens()), ("textbook", load_lens("textbook_window")))
+    }
+    assert means["own"] < 0.9 * means["textbook"]
+    metrics = found.metrics
+    assert metrics["transmission/initial"] < metrics["transmission/published"]
+    assert metrics["transmission/published"] < metrics["transmission/final"] < 1.0
