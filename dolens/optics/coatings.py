@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.materials import Medium
-from dolens.optics.thin_films import Layer, Polarised, amplitudes, shares
+from dolens.optics.thin_films import Layer, Parts, Polarised, amplitudes, shares, transparent
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,13 @@ class CoatingState:
         """Return shares of power (...); arguments as above."""
         raise NotImplementedError
 
+    def transmitted(
+        self, front: Any, behind: Any, cosine: Tensor, wavelength: float | Tensor
+    ) -> tuple[Parts, Parts]:
+        """Return the amplitudes t_s and t_p (...); arguments as above."""
+        found = self.amplitudes(front, behind, cosine, wavelength)
+        return Parts.of(found.t_s), Parts.of(found.t_p)
+
 
 @dataclass(frozen=True)
 class Stack(CoatingState):
@@ -135,6 +142,13 @@ class Stack(CoatingState):
         """Return the amplitudes of the stack."""
         last = self.behind(behind, wavelength)
         return amplitudes(front, self._layers(wavelength), last, cosine, wavelength)
+
+    def transmitted(
+        self, front: Any, behind: Any, cosine: Tensor, wavelength: float | Tensor
+    ) -> tuple[Parts, Parts]:
+        """Return the amplitudes t_s and t_p of the stack, by real arithmetic where it can be."""
+        found = transparent(front, self._layers(wavelength), behind, cosine, wavelength)
+        return found or super().transmitted(front, behind, cosine, wavelength)
 
     def shares(
         self, front: Any, behind: Any, cosine: Tensor, wavelength: float | Tensor

@@ -23,6 +23,7 @@ from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.materials import MIRROR, Medium, media_of
 from dolens.optics.paraxial import vergence
 from dolens.optics.paraxial_rays import ideal_lenses, reversals, with_vergences
+from dolens.optics.polarisation import PolarisedRays, trace_polarised
 from dolens.optics.prescription_table import PrescriptionTable, prescription_table
 from dolens.optics.ray_tracing import BACKENDS, is_few, trace_rays
 from dolens.optics.rays import Rays, TracedRays
@@ -355,6 +356,20 @@ class Lens(LensRays, InStates, nn.Module):
         """
         self._check_range(first, last)
         return trace_rays(self._system_for(rays), rays, 1.0, record, first, last, transmission)
+
+    def trace_polarised(self, rays: Rays) -> PolarisedRays:
+        """Trace rays to the sensor, and the electric field along them.
+
+        Surfaces without a coating are ideal, and change no polarisation.  The scalar `transmission`
+        of `trace` multiplies means over s and p; this one follows each.
+
+        Args:
+            rays: as `trace` takes them.
+
+        Raises:
+            InputError: a coating that is a table of shares, which has no phases.
+        """
+        return trace_polarised(self.system(), rays)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None

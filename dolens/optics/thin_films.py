@@ -49,6 +49,46 @@ class Polarised(NamedTuple):
     t_p: Tensor
 
 
+class Parts(NamedTuple):
+    """A complex number (...) as two real ones; a product with real ones takes half of the time.
+
+    Attributes:
+        real: its real part.
+        imaginary: None: zero.
+    """
+
+    real: Tensor
+    imaginary: Tensor | None = None
+
+    @staticmethod
+    def of(value: Tensor) -> "Parts":
+        """Return the parts of a complex tensor."""
+        return Parts(value.real, value.imag)
+
+    def times(self, real: Tensor | float) -> "Parts":
+        """Return the product with a real number."""
+        i = self.imaginary
+        return Parts(self.real * real, None if i is None else i * real)
+
+    def plus(self, other: "Parts") -> "Parts":
+        """Return the sum."""
+        i, j = self.imaginary, other.imaginary
+        return Parts(self.real + other.real, j if i is None else i if j is None else i + j)
+
+    def minus(self, other: "Parts") -> "Parts":
+        """Return the difference."""
+        return self.plus(other.times(-1.0))
+
+    def product(self, other: "Parts") -> "Parts":
+        """Return the product."""
+        (a, b), (c, d) = self, other
+        if b is None:
+            return other.times(a)
+        if d is None:
+            return self.times(c)
+        return Parts(torch.addcmul(a * c, b, d, value=-1.0), torch.addcmul(a * d, b, c))
+
+
 class _Boundary(NamedTuple):
     """Amplitudes where two media meet; t is over the normal wavenumber in front."""
 
@@ -114,6 +154,64 @@ def shares(
     media = _Media(front, layers, behind, cosine, wavelength)
     whole = _reflected(media)[0].whole
     return _shares(media, whole)
+
+
+def transparent(
+    front: Tensor | float,
+    layers: Sequence[Layer],
+    behind: Tensor | float,
+    cosine: Tensor,
+    wavelength: Tensor | float,
+) -> tuple[Parts, Parts] | None:
+    """Return the amplitudes t_s and t_p of a transparent stack, by real arithmetic.
+
+    None where a medium absorbs, or light is totally reflected in one.
+
+    By characteristic matrices (Born and Wolf 1.6.2).  Arguments are those of `amplitudes`.
+    """
+    media = (front, *(layer.index for layer in layers), behind)
+    if any(isinstance(n, complex) or (isinstance(n, Tensor) and n.is_complex()) for n in media):
+        return None
+    n = [torch.as_tensor(index, dtype=cosine.dtype, device=cosine.device) for index in media]
+    square = (n[0] * cosine).square()
+    squares = [square, *(square + (m - n[0]) * (m + n[0]) for m in n[1:])]
+    if not all(bool((s.detach() > _FAR_FROM_TOTAL).all()) for s in squares):
+        return None
+    q = [s.sqrt() for s in squares]
+    k = 2.0 * math.pi / torch.as_tensor(wavelength, dtype=cosine.dtype, device=cosine.device)
+    turns = [k * layer.thickness * p for layer, p in zip(layers, q[1:], strict=False)]
+    waves = [(phase.cos(), phase.sin()) for phase in turns]
+    # Of the tangential fields; that of p is cos θ of the whole.
+    of_s = _through(q, waves)
+    ratio = q[0] * n[-1] / (q[-1] * n[0])
+    of_p = _through([m * m / p for m, p in zip(n, q, strict=True)], waves)
+    return of_s, of_p.times(ratio)
+
+
+# Square of a normal wavenumber over the vacuum's, above which derivatives of its root are harmless.
+_FAR_FROM_TOTAL = 1e-6
+
+
+def _through(admittance: list[Tensor], waves: list[tuple[Tensor, Tensor]]) -> Parts:
+    """Return 2η/(η·B + C) of the tangential electric field, with (B, C) = M·(1, η').
+
+    Args:
+        admittance: η of each medium.
+        waves: cosine and sine of each layer's phase.
+    """
+    y, last = admittance[0], admittance[-1]
+    if not waves:
+        return Parts(2.0 * y / (y + last))
+    # B = b + i·e and C = c + i·f; a transparent layer mixes b with f, and c with e.
+    (b, sine), inner = waves[-1], admittance[-2]
+    c, e, f = b * last, sine * last / -inner, -sine * inner
+    for eta, (cosine, sine) in zip(admittance[-3:0:-1], waves[-2::-1], strict=True):
+        thin, thick = sine / eta, sine * eta
+        b, f = cosine * b + thin * f, cosine * f - thick * b
+        c, e = cosine * c + thick * e, cosine * e - thin * c
+    real, imaginary = torch.addcmul(c, y, b), torch.addcmul(f, y, e)
+    share = 2.0 * y / torch.addcmul(real * real, imaginary, imaginary)
+    return Parts(share * real, -share * imaginary)
 
 
 def absorbed(

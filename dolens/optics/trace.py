@@ -39,6 +39,30 @@ class Shares(NamedTuple):
     surface: Tensor | float
 
 
+class Crossing(NamedTuple):
+    """Rays cross a surface; components are in its axes.
+
+    Attributes:
+        number: of the surface, from 1.
+        point: x, y, z, mm.
+        arriving: direction in front of the surface.
+        leaving: direction behind it.
+        indices: in front and behind.
+        passed: the medium in front counts from 0, as `OpticalSystem.materials` does.
+        distance: mm, through that medium.
+        axes: of the surface.
+    """
+
+    number: int
+    point: tuple[Tensor, Tensor, Tensor]
+    arriving: tuple[Tensor, Tensor, Tensor]
+    leaving: tuple[Tensor, Tensor, Tensor]
+    indices: tuple[float | Tensor, float | Tensor]
+    passed: int
+    distance: Tensor
+    axes: Axes
+
+
 @dataclass(frozen=True)
 class Trace:
     """Rays after the last surface (or on the sensor), as components.
@@ -187,6 +211,7 @@ def trace_surfaces(
     first: int = 1,
     last: int | None = None,
     transmission: bool = False,
+    crossings: list[Crossing] | None = None,
 ) -> Trace:
     """Trace rays through surfaces `first` to `last`, in the order that light meets them.
 
@@ -200,6 +225,7 @@ def trace_surfaces(
         first: number of the first surface, from 1, as the prescription counts in either sense.
         last: number of the last surface; None: of the lens.
         transmission: whether to find the shares of light that each surface and medium passes.
+        crossings: of every surface met one is appended, where a list is given.
 
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
@@ -258,6 +284,13 @@ def trace_surfaces(
                 parameters, (x, y, z), (l, m, n), before / after, leaving
             )
         margins.append(Margins(number, met, inside, transmitted))
+        if crossings is not None:
+            distance = to_plane + t if carried is None else carried + to_plane + t
+            crossings.append(
+                Crossing(
+                    number, (x, y, z), here[3:], (l, m, n), (before, after), front, distance, axes
+                )
+            )
         ray = Components(x, y, z, l, m, n)
     valid = _all_positive(margins, ray.n)
     return Trace(to_lens_axes(ray, axes), valid, margins, path, shares, points, ray, axes)

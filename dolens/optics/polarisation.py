@@ -1,0 +1,312 @@
+"""Polarisation ray tracing: what a lens does to the electric field along each ray.
+
+The polarisation ray-tracing matrix P takes the field in front of the lens to that behind it, both
+as three components in the lens's axes (Yun, Crabtree and Chipman, Appl. Opt. 50, 2855 (2011);
+Chipman, Lam and Young, *Polarized Light and Optical Systems*, chapter 9):
+
+    P = ∏ O'·diag(t_s, t_p, 1)·O⁻¹,    O = (s, k × s, k),    O' = (s, k' × s, k'),
+
+with the ray's directions k and k', and s along the normal of the plane of incidence.  s has no
+direction at normal incidence, so that P is found in another way.  A surface that changes no field
+(t_s = t_p = 1; a mirror r_s = -1, r_p = 1) turns two vectors u₁, u₂ across the ray,
+
+    u' = u - (k + k')·(k'·u)/(1 + k·k');    of a mirror  u' = 2n·(n·u) - u,
+
+with its normal n.  Carried through the lens so, they are axes across the ray in front of each
+surface.  There a surface's own effect is a Jones matrix,
+
+    t_s + (t_p - t_s)·w·wᵀ/|w|²,    w = (n·u₁, n·u₂),
+
+with -r_s and r_p of a mirror.  |w| is the sine of the angle of incidence, and t_p - t_s is of its
+square's order.  The product J of these is what polarises; the turn of the axes is geometry alone
+(Yun, McClain and Chipman, Appl. Opt. 50, 2866 (2011)), and
+
+    P = (u₁', u₂', k')·[[J, 0], [0, 1]]·(u₁, u₂, k)ᵀ.
+
+Fields are roots of power: t stands for t·√(n'·cos θ'/(n·cos θ)), so that ½·tr(J†J) is the share of
+unpolarised light that arrives.  Time goes as exp(-iωt); the phase of the path is left out.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.optics.coatings import CoatingState, Stack
+from dolens.optics.elements import to_lens_axes
+from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.surfaces.deflection import Vector
+from dolens.optics.system import OpticalSystem
+from dolens.optics.thin_films import Parts
+from dolens.optics.trace import (
+    Crossing,
+    Shares,
+    enter_lens,
+    stop_gradient_where_invalid,
+    trace_surfaces,
+    trace_to_sensor,
+    traced_rays,
+)
+
+
+@dataclass(frozen=True)
+class PolarisedRays:
+    """Rays after a trace, and what became of the field along them.
+
+    Attributes:
+        rays: as `Lens.trace` gives them.
+        front: (..., 3, 3), columns: axes u₁ and u₂ across the ray in front of the lens, and its
+            direction; in the lens's axes.
+        behind: (..., 3, 3), the same behind the last surface, the axes carried there.
+        jones: (..., 2, 2), complex, from the axes in front to those behind; see the module.
+
+    Where a ray is invalid, numbers are finite and carry no gradient.
+    """
+
+    rays: TracedRays
+    front: Tensor
+    behind: Tensor
+    jones: Tensor
+
+    @property
+    def transmission(self) -> Tensor:
+        """(...), share of unpolarised light that arrives, ½·tr(J†J)."""
+        parts = torch.view_as_real(self.jones).square().sum((-1, -2, -3))
+        return 0.5 * parts
+
+    @property
+    def matrix(self) -> Tensor:
+        """(..., 3, 3), complex: P, in the lens's axes.  It takes k to k'."""
+        behind, front = (v.to(self.jones.dtype) for v in (self.behind, self.front))
+        across = behind[..., :2] @ self.jones @ front[..., :2].mT
+        return across + behind[..., 2:] * front[..., None, :, 2]
+
+    def in_axes(self, front: Tensor, behind: Tensor) -> Tensor:
+        """Return Jones matrices (..., 2, 2) between other axes.
+
+        Args:
+            front: (..., 3, 2), columns: axes across the ray in front of the lens.
+            behind: (..., 3, 2), axes across the ray behind it.
+        """
+        given = self.front[..., :2].mT @ front.to(self.front)
+        wanted = behind.to(self.behind).mT @ self.behind[..., :2]
+        return wanted.to(self.jones.dtype) @ self.jones @ given.to(self.jones.dtype)
+
+
+def double_pole_axes(direction: Tensor, pole: Tensor) -> Tensor:
+    """Return axes across rays by Chipman's double-pole coordinates, (..., 3, 2).
+
+    The lens's x and y, turned along great circles from z to the pole and from there to the ray.
+    They have no singularity but opposite to the pole.  Where the pole points towards -z, x and y
+    come there from -z, and x × y is against the light.
+
+    Args:
+        direction: (..., 3), unit vectors.
+        pole: (..., 3), unit vector that the axes turn about as little as they can: the direction of
+            the chief ray.
+    """
+    start = torch.zeros_like(pole)
+    start[..., 2] = 1.0 - 2.0 * (pole[..., 2].detach() < 0.0).to(pole.dtype)
+    x, y = (torch.eye(3, dtype=pole.dtype, device=pole.device)[i] for i in (0, 1))
+    found = [turned(turned(axis, start, pole), pole, direction) for axis in (x, y)]
+    return torch.stack(found, -1)
+
+
+def turned(vector: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Return vectors (..., 3) across `start`, turned as it is turned to `end` by the least angle.
+
+    Both are unit vectors (..., 3), and not opposite.
+    """
+    cosine = (start * end).sum(-1, keepdim=True)
+    return vector - (start + end) * ((vector * end).sum(-1, keepdim=True) / (1.0 + cosine))
+
+
+def trace_polarised(system: OpticalSystem, rays: Rays) -> PolarisedRays:
+    """Trace rays to the sensor, and the field along them.
+
+    The reference traces; all is differentiable, in the lens's precision.
+
+    Args:
+        system: the lens.
+        rays: as users give them.
+
+    Raises:
+        InputError: a coating that is a table of shares, which has no phases.
+    """
+    ray, before = enter_lens(system, rays, 1, 1.0)
+    crossings: list[Crossing] = []
+    wavelength = rays.wavelength
+    traced = trace_surfaces(system, ray, wavelength, path_length=True, crossings=crossings)
+    field = _Field(system, crossings, wavelength)
+    passed = torch.exp(-field.absorbed) if isinstance(field.absorbed, Tensor) else 1.0
+    traced = trace_to_sensor(system, replace(traced, shares=[Shares(passed, 1.0)]), wavelength)
+    media = math.prod(share.medium for share in traced.shares or [])
+    root = media.sqrt() if isinstance(media, Tensor) else None
+    return _joined(traced_rays(replace(traced, shares=None), before), field, root)
+
+
+def _joined(rays: TracedRays, field: "_Field", root: Tensor | None) -> PolarisedRays:
+    """Join what was found for users; the root is that of the glasses' transmittances."""
+    valid = rays.valid
+
+    def joined(columns: tuple[Vector, ...]) -> Tensor:
+        rows = [torch.stack([v.expand(valid.shape) for v in column], -1) for column in columns]
+        return stop_gradient_where_invalid(torch.stack(rows, -1), valid[..., None, None])
+
+    one = torch.ones_like(field.front[2][0]).expand(valid.shape)
+    zero = torch.zeros_like(one)
+    given = field.jones or [Parts(v) for v in (one, zero, zero, one)]
+    parts = [j if root is None else j.times(root) for j in given]
+    real = [(j.real, zero if j.imaginary is None else j.imaginary) for j in parts]
+    matrix = torch.stack([torch.stack([v.expand(valid.shape) for v in j], -1) for j in real], -2)
+    matrix = stop_gradient_where_invalid(matrix, valid[..., None, None])
+    jones = torch.view_as_complex(matrix).unflatten(-1, (2, 2))
+    return PolarisedRays(rays, joined(field.front), joined(field.behind), jones)
+
+
+class _Field:
+    """The field is carried along rays, surface by surface.
+
+    Attributes:
+        real: the precision of the rays.
+        front: u₁, u₂, k in front of the lens, in its axes.
+        behind: the same, carried behind the last surface.
+        jones: J₁₁, J₁₂, J₂₁, J₂₂; empty where no surface changes the field.
+        absorbed: Σ a·t, of the glasses' absorption up to the last surface.
+    """
+
+    def __init__(
+        self, system: OpticalSystem, crossings: list[Crossing], wavelength: float | Tensor
+    ) -> None:
+        self.system, self.wavelength = system, wavelength
+        first = crossings[0]
+        k = _to_lens(first, first.arriving)
+        self.real = k[0].dtype
+        self.front = (*_axes_across(k), k)
+        self.behind = self.front
+        self.jones: list[Parts] = []
+        self.absorbed: Tensor | float = 0.0
+        absorptions = system.absorptions(wavelength)
+        for crossing in crossings:
+            rate = absorptions[crossing.passed]
+            if isinstance(rate, Tensor) or rate != 0.0:
+                self.absorbed = self.absorbed + rate * crossing.distance
+            self._cross(crossing)
+
+    def _cross(self, crossing: Crossing) -> None:
+        number = crossing.number
+        surface, mirror = self.system.surfaces[number - 1], number in self.system.mirrors
+        refracts = surface.deflection is not None or self.system.refracts(number)
+        if surface.coating is None and not refracts:
+            return
+        u, v, k = self.behind
+        if surface.coating is not None or mirror:
+            normal = surface.shape.normal(surface.parameters, *crossing.point)
+            n = _to_lens(crossing, normal)
+            w = _dot(n, u), _dot(n, v)
+        if surface.coating is not None:
+            cosine = _dot(n, k).abs().clamp(max=1.0)
+            t, g = _effect(surface.coating, mirror, crossing.indices, cosine, w, self.wavelength)
+            self._pass(t, g, w)
+        if not refracts:
+            return
+        onward = _to_lens(crossing, crossing.leaving)
+        if mirror:
+            carried = [_reflected(n, along, a) for a, along in zip((u, v), w, strict=True)]
+        else:
+            carried = _turned((u, v), k, onward)
+        self.behind = (carried[0], carried[1], onward)
+
+    def _pass(self, t: Parts, g: Parts, w: tuple[Tensor, Tensor]) -> None:
+        """Multiply by t + g·w·wᵀ."""
+        rows = [g.times(w[0]), g.times(w[1])]
+        if not self.jones:
+            off = rows[0].times(w[1])
+            self.jones = [t.plus(rows[0].times(w[0])), off, off, t.plus(rows[1].times(w[1]))]
+            return
+        upper, lower = self.jones[:2], self.jones[2:]
+        along = [a.times(w[0]).plus(b.times(w[1])) for a, b in zip(upper, lower, strict=True)]
+        self.jones = [
+            t.product(j).plus(row.product(n))
+            for row, given in zip(rows, (upper, lower), strict=True)
+            for j, n in zip(given, along, strict=True)
+        ]
+
+
+def _effect(
+    coating: CoatingState,
+    mirror: bool,
+    indices: tuple[float | Tensor, float | Tensor],
+    cosine: Tensor,
+    w: tuple[Tensor, Tensor],
+    wavelength: float | Tensor,
+) -> tuple[Parts, Parts]:
+    """Return t_s and (t_p - t_s)/sin² of a surface as roots of power, of a mirror -r_s and
+    (r_p + r_s)/sin².
+    """
+    n, m = indices
+    if mirror:
+        found = coating.amplitudes(n, m, cosine, wavelength)
+        r_s, r_p = Parts.of(found.r_s), Parts.of(found.r_p)
+        return r_s.times(-1.0), r_p.plus(r_s).times(_over_square(w))
+    q = n * cosine
+    # Held above zero, where the root has a derivative; no ray goes on there.
+    p = ((m - n) * (m + n) + q * q).clamp(min=torch.finfo(q.dtype).tiny ** 0.5).sqrt()
+    root = (p / q.clamp(min=torch.finfo(q.dtype).tiny ** 0.25)).sqrt()
+    if isinstance(coating, Stack) and not coating.films:
+        # In Fresnel's equations the square of the sine is a factor of the difference.
+        s = 2.0 * q / (q + p)
+        bend = (n - m) * (n - m) * (n + m) * n * n
+        g = bend * s / ((m * q + n * p) * (m * m * q + n * n * p))
+        return Parts(root * s), Parts(root * g)
+    of_s, of_p = coating.transmitted(n, m, cosine, wavelength)
+    return of_s.times(root), of_p.minus(of_s).times(root * _over_square(w))
+
+
+def _over_square(w: tuple[Tensor, Tensor]) -> Tensor:
+    """Return 1/w²; zero where what it multiplies, of the order of w², is rounding."""
+    square = torch.addcmul(w[0] * w[0], w[1], w[1])
+    small = square.detach() < torch.finfo(square.dtype).eps
+    return square.masked_fill(small, torch.inf).reciprocal()
+
+
+def _to_lens(crossing: Crossing, direction: Vector) -> Vector:
+    """Return a direction, in the axes of a surface, in the lens's."""
+    if crossing.axes.rotation is None:
+        return direction
+    found = to_lens_axes(Components(*direction, *direction), crossing.axes)
+    return (found.l, found.m, found.n)
+
+
+def _axes_across(k: Vector) -> tuple[Vector, Vector]:
+    """Return two axes across rays that do not run along -z, or not along +z: x and y, turned."""
+    x, y, z = k
+    sign = torch.where(z.detach() < 0.0, -1.0, 1.0).to(z.dtype)
+    a = 1.0 / (1.0 + sign * z)
+    cross = -x * y * a
+    return (1.0 - x * x * a, cross, -sign * x), (cross, 1.0 - y * y * a, -sign * y)
+
+
+def _dot(a: Vector, b: Vector) -> Tensor:
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+
+
+def _turned(axes: tuple[Vector, ...], k: Vector, onward: Vector) -> list[Vector]:
+    """Return axes across k, turned as it is turned to another direction by the least angle."""
+    # An invalid ray may be turned round.
+    share = -1.0 / (1.0 + _dot(k, onward)).clamp(min=1e-3)
+    x, y, z = (a + b for a, b in zip(k, onward, strict=True))
+    found: list[Vector] = []
+    for u in axes:
+        f = share * _dot(u, onward)
+        found.append(
+            (torch.addcmul(u[0], f, x), torch.addcmul(u[1], f, y), torch.addcmul(u[2], f, z))
+        )
+    return found
+
+
+def _reflected(n: Vector, along: Tensor, u: Vector) -> Vector:
+    """Return 2n·(n·u) - u."""
+    twice = 2.0 * along
+    return (twice * n[0] - u[0], twice * n[1] - u[1], twice * n[2] - u[2])
