@@ -25,6 +25,7 @@ from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
+from dolens.files import much_at_once
 from dolens.kernels.cpu import kernel_files
 from dolens.kernels.cpu.kernel_files import KernelFiles
 from dolens.kernels.cpu.layout import BLOCK
@@ -34,7 +35,13 @@ logger = logging.getLogger("dolens.kernels")
 
 # NaN keeps its meaning and division stays exact; the rest of `fastmath` gains nothing more.
 FASTMATH = {"contract", "reassoc", "nsz"}
-OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy"}
+# Kernels are called by their addresses, and what they call is inlined: Python calls neither.
+OPTIONS: dict[str, Any] = {
+    "fastmath": FASTMATH,
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 
 INTEGERS = types.CPointer(types.int64)
 REALS = {"float32": types.float32, "float64": types.float64}
@@ -214,7 +221,10 @@ def _read(files: KernelFiles) -> int | None:
 def _made(factory: Factory, real: str, signature: Any) -> CFunc:
     form = normalize_signature(signature)
     kernel = CFunc(factory(REALS[real]), form, locals={}, options=dict(OPTIONS))
-    with _unrolled(factory.longest) if hasattr(factory, "longest") else nullcontext():
+    with (
+        _unrolled(factory.longest) if hasattr(factory, "longest") else nullcontext(),
+        much_at_once(),
+    ):
         kernel.compile()
     # The function itself belongs to the engine of Numba, which is there for good.
     return kernel
