@@ -69,6 +69,7 @@ def much_at_once() -> Iterator[None]:
     """Let Python not look for circles among what is read, over all of it again and again.
 
     There are none in the values of a file, and with many of them nothing else would take as long.
+    Modules and what a compiler makes have them, and mostly stay.
     """
     before = gc.isenabled()
     gc.disable()

@@ -33,8 +33,9 @@ TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in
 # in one process, a copy of one that has imported PyTorch and Lightning, which takes longer.
 IN_TWO_PROCESSES = """
 import json, os, runpy, sys, traceback
-import dolens.experiments.running.main
 from dolens.cli.app import main
+from dolens.cli.extras import import_extra
+import_extra("dolens.experiments.running.main", "train", "dolens train")
 for number, commands in enumerate(json.loads(sys.argv[1])):
     sys.stdout.flush()
     if os.fork():
