@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, diffracted_light, on_disc
 from dolens.errors import InputError
-from dolens.optics.elements import Axes, from_lens_axes, to_lens_axes
+from dolens.optics.elements import Axes, from_lens_axes, points_to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays
@@ -243,11 +243,11 @@ def _aimed(axes: Axes, radius: float, u: Tensor, v: Tensor, start: Tensor) -> tu
     angle a part of the disc's area takes (N,).
     """
     x, y = on_disc(u, v, radius)
-    local = Components(x, y, *4 * (torch.zeros_like(x),))
-    d = torch.stack(to_lens_axes(local, axes)[:3], -1) - start
+    local = x, y, torch.zeros_like(x)
+    d = torch.stack(points_to_lens_axes(local, axes), -1) - start
     distance = d.norm(dim=-1)
     d = d / distance[:, None]
-    cosine = from_lens_axes(Components(*local[:3], *d.unbind(-1)), axes).n
+    cosine = from_lens_axes(Components(*local, *d.unbind(-1)), axes).n
     return d, cosine / distance**2
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import launch, line_of_slopes
-from dolens.optics.elements import to_lens_axes
+from dolens.optics.elements import points_to_lens_axes
 from dolens.optics.paraxial import entrance_pupil, matrix_to_stop
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays
@@ -369,9 +369,7 @@ def _first_surface(system: OpticalSystem, points: ObjectPoints) -> tuple[Tensor,
     radius = radius / math.cos(math.pi / _AZIMUTHS)
     x, y = (radius * azimuth.cos()).flatten(), (radius * azimuth.sin()).flatten()
     sag = surface.shape.sag_and_gradient(surface.parameters, x, y)[0]
-    zero = torch.zeros_like(x)
-    there = to_lens_axes(Components(x, y, sag, zero, zero, zero + 1.0), axes)
-    position = torch.stack(there[:3], -1)
+    position = torch.stack(points_to_lens_axes((x, y, sag), axes), -1)
 
     line = torch.nn.functional.pad(points.slopes, (0, 1), value=1.0)
     line = line / line.norm(dim=-1, keepdim=True)

@@ -15,6 +15,8 @@ TILTS = ("tilt_x", "tilt_y", "tilt_z")
 DISPLACEMENTS = ("decenter_x", "decenter_y", "shift_z")
 POSE = (*TILTS, *DISPLACEMENTS)
 
+Points = tuple[Tensor, Tensor, Tensor]  # x, y, z
+
 
 class Element(nn.Module):
     """State of an element: which surfaces it holds, and its pose.
@@ -252,23 +254,40 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
 def to_lens_axes(ray: Components, axes: Axes) -> Components:
     """Rays in a surface's axes, seen from the lens's."""
     x, y, z, l, m, n = ray  # noqa: E741
+    points = points_to_lens_axes((x, y, z), axes)
     if axes.rotation is None:
-        return Components(x, y, z + axes.z, l, m, n)
+        return Components(*points, l, m, n)
+    return Components(*points, *_turn(axes.rotation.to(n.dtype), l, m, n))
+
+
+def points_to_lens_axes(points: Points, axes: Axes) -> Points:
+    """Points (x, y, z) in a surface's axes, in mm, seen from the lens's."""
+    x, y, z = points
+    if axes.rotation is None:
+        return x, y, z + axes.z
     assert axes.origin is not None  # as there is a rotation
-    rotation, (ox, oy, oz) = axes.rotation.to(n.dtype), axes.origin.to(n.dtype).unbind()
-    px, py, pz = _turn(rotation, x, y, z)
-    return Components(px + ox, py + oy, pz + oz, *_turn(rotation, l, m, n))
+    x, y, z = _turn(axes.rotation.to(z.dtype), x, y, z)
+    ox, oy, oz = axes.origin.to(z.dtype).unbind()
+    return x + ox, y + oy, z + oz
 
 
 def from_lens_axes(ray: Components, axes: Axes) -> Components:
     """Rays in the lens's axes, seen from a surface's; the inverse of `to_lens_axes`."""
     x, y, z, l, m, n = ray  # noqa: E741
+    points = points_from_lens_axes((x, y, z), axes)
     if axes.rotation is None:
-        return Components(x, y, z - axes.z, l, m, n)
+        return Components(*points, l, m, n)
+    return Components(*points, *_turn(axes.rotation.to(n.dtype).mT, l, m, n))
+
+
+def points_from_lens_axes(points: Points, axes: Axes) -> Points:
+    """Points in the lens's axes, seen from a surface's; the inverse of `points_to_lens_axes`."""
+    x, y, z = points
+    if axes.rotation is None:
+        return x, y, z - axes.z
     assert axes.origin is not None  # as there is a rotation
-    turn = axes.rotation.to(n.dtype).mT
-    ox, oy, oz = axes.origin.to(n.dtype).unbind()
-    return Components(*_turn(turn, x - ox, y - oy, z - oz), *_turn(turn, l, m, n))
+    ox, oy, oz = axes.origin.to(z.dtype).unbind()
+    return _turn(axes.rotation.to(z.dtype).mT, x - ox, y - oy, z - oz)
 
 
 def _motion(element: ElementState, vertices: Sequence[Tensor]) -> Motion:
@@ -290,6 +309,6 @@ def _origin(axes: Axes, like: Tensor) -> Tensor:
     return torch.stack([zero, zero, z])
 
 
-def _turn(r: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _turn(r: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Points:
     a, b, c = (torch.addcmul(torch.addcmul(r[i, 0] * x, r[i, 1], y), r[i, 2], z) for i in range(3))
     return a, b, c

@@ -8,7 +8,14 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.table import GRAZING
-from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
+from dolens.optics.elements import (
+    LENS_AXES,
+    Axes,
+    change_axes,
+    from_lens_axes,
+    points_to_lens_axes,
+    to_lens_axes,
+)
 from dolens.optics.rays import (
     Components,
     Rays,
@@ -247,7 +254,7 @@ def trace_surfaces(
         if shape.changes_axes:
             if record:
                 crossing, _ = change_axes(ray, axes, places[i])
-                points.append(to_lens_axes(crossing, places[i])[:3])
+                points.append(points_to_lens_axes(crossing[:3], places[i]))
             continue
         front, back = (i, i + 1) if sense > 0 else (i + 1, i)
         before, after = indices[front], indices[back]
@@ -261,7 +268,7 @@ def trace_surfaces(
         if path is not None:
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
         if record:
-            points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
+            points.append(points_to_lens_axes((x, y, z), axes))
         if shares is not None:
             distance = to_plane + t if carried is None else carried + to_plane + t
             passes: Tensor | float = 1.0

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
-from dolens.optics.elements import to_lens_axes
+from dolens.optics.elements import points_to_lens_axes
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
@@ -362,7 +362,7 @@ def ray_paths(
     landed = trace_to_sensor(system, traced, wavelength)
     end = landed.ray._replace(z=landed.ray.z - system.vertices[-1])
     met = [traced.points[number - 1] for number in system.met]
-    points = [ray[:3], *met, to_lens_axes(end, system.all_axes[-1])[:3]]
+    points = [ray[:3], *met, points_to_lens_axes(end[:3], system.all_axes[-1])]
     return torch.stack([torch.stack(point, -1) for point in points], -2), landed.valid
 
 

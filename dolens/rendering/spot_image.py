@@ -14,7 +14,7 @@ from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 from dolens.errors import InputError
-from dolens.optics.elements import from_lens_axes, to_lens_axes
+from dolens.optics.elements import from_lens_axes, points_from_lens_axes, points_to_lens_axes
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
@@ -155,8 +155,7 @@ class SpotImager:
         radius = self.reach * semi_diameter
         area = math.pi * radius**2 / self.rays
         axes = system.axes[0]
-        aim = Components(radius * u, radius * v, *(torch.zeros_like(u) for _ in range(4)))
-        to = to_lens_axes(aim, axes)[:3]
+        to = points_to_lens_axes((radius * u, radius * v, torch.zeros_like(u)), axes)
         d = [t - s for t, s in zip(to, source.to(u).unbind(), strict=True)]
         distance = torch.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         l, m, n = (c / distance for c in d)  # noqa: E741
@@ -176,11 +175,10 @@ class SpotImager:
             aimed: squares of the rays' distances from the axis in the disc that they aim at.
         """
         share, goes_on = torch.ones_like(aimed), torch.ones_like(aimed, dtype=torch.bool)
-        zero = torch.zeros_like(aimed)
         for surface, axes, point, margins in zip(
             system.surfaces, system.axes, trace.points, trace.margins, strict=True
         ):
-            x, y = from_lens_axes(Components(*point, zero, zero, zero), axes)[:2]
+            x, y, _ = points_from_lens_axes(point, axes)
             depth = surface.aperture.depth(x, y) / (self.rim * surface.semi_diameter)
             step = (depth + 0.5).clamp(0.0, 1.0)
             share = share * step * step * (3.0 - 2.0 * step)
