@@ -74,7 +74,7 @@ def encircled_energy(
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
     where = where.that_count()
     intercepts = trace_ray_intercepts(lens, where, pupil)
-    light = (weight * intercepts.valid * where.weights[:, None]).flatten(1, 2)
+    light = (weight * intercepts.light * where.weights[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     centroid, _ = moments(points, light)
     distance = 1e3 * (points - centroid[:, None]).norm(dim=-1)

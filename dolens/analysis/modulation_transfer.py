@@ -137,7 +137,7 @@ def modulation(
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
     where = where.that_count()
     intercepts = trace_ray_intercepts(lens, where, pupil, aimed=aimed)
-    light = (weight * intercepts.valid * where.weights[:, None]).flatten(1, 2)
+    light = (weight * intercepts.light * where.weights[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
     along = field_directions(where)

@@ -32,7 +32,8 @@ class SpotRays:
     Attributes:
         rays: N rays, (N, 3), with wavelengths (N,), spot after spot.
         spot: (N,), int64, from 0 to S - 1.
-        weight: (N,), float64, the share of a ray in its spot; they sum to one over each spot.
+        weight: (N,), float64, the share of a ray in its spot; they sum to one over each spot.  Of a
+            lens with coatings a ray counts by what of its light arrives.
         fields: (S, 2), degrees or mm, float64.
         wavelengths: (S,), nm, float64.
         centred: (S, 2), bool: the spot's mean in x, or in y, is zero by symmetry, because the rays
@@ -274,12 +275,16 @@ def _passing(
             launches[field] = launch(field)
         position, direction, weight, whole = launches[field]
         position, direction = position.to(**options), direction.to(**options)
-        valid = trace_rays(lens.system(), Rays(position, direction, nm)).valid
+        system = lens.system()
+        hit = trace_rays(system, Rays(position, direction, nm), transmission=system.coated)
+        valid = hit.valid
         launched += valid.numel()
         if not bool(valid.any()):
             raise InputError(f"no ray of field {field} and {nm:g} nm passes the lens")
         weight = weight.to(valid.device)[valid]
         light.append(float(weight.sum()) / whole)
+        if hit.transmission is not None:
+            weight = weight * hit.transmission[valid].to(weight)
         pieces.append(
             (
                 position[valid],

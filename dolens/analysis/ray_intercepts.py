@@ -44,12 +44,15 @@ class RayIntercepts:
             does not pass.  On a curved sensor distances from the chief ray's point are those in
             the plane that touches it there.
         valid: (F, W, N), bool.
+        light: (F, W, N), zero where a ray does not pass, else one, or of a lens with coatings the
+            share of unpolarised light that arrives.
         chief: (F, 2), mm, intercepts of the chief rays of the reference wavelength, whether
             apertures clip them or not; NaN where one does not reach the sensor.
     """
 
     points: Tensor
     valid: Tensor
+    light: Tensor
     chief: Tensor
 
 
@@ -112,7 +115,8 @@ def trace_ray_intercepts(
     """
     launched = launch_through_stop(lens, where, pupil, exact, aimed)
     system = in_double_precision(lens).system()
-    hit, chief = trace_rays(system, launched.rays), trace_rays(system, launched.chief)
+    hit = trace_rays(system, launched.rays, transmission=system.coated)
+    chief = trace_rays(system, launched.chief)
     valid = hit.valid & launched.started
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & launched.chief_started
@@ -122,6 +126,7 @@ def trace_ray_intercepts(
     return RayIntercepts(
         points.where(valid[..., None], math.nan).cpu(),
         valid.cpu(),
+        (valid if hit.transmission is None else valid * hit.transmission).double().cpu(),
         chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
     )
 

@@ -78,7 +78,7 @@ def spot_diagram(
     intercepts = trace_ray_intercepts(lens, where, pupil, aimed=aimed)
     points, valid = intercepts.points, intercepts.valid
 
-    light = weight * valid
+    light = weight * intercepts.light
     centroid, mean_square = moments(points, light)
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
     every = (light * where.weights[:, None]).flatten(1, 2)

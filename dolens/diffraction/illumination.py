@@ -40,7 +40,8 @@ def relative_illumination(
 
     The irradiance at an image point is the radiance times the area of the exit pupil in direction
     cosines as the point sees it, ∬dα dβ (Rimmer, Proc. SPIE 655, 99, 1986): the rays of an object
-    point are taken to meet in one image point.
+    point are taken to meet in one image point.  Of a lens with coatings each direction counts by
+    what of its light arrives.
 
     Args:
         lens: the lens.
@@ -55,7 +56,8 @@ def relative_illumination(
         lens, conditions(lens, fields, wavelength, distance or torch.inf), samples
     )
     front = found.wavefront
-    area = (front.area * front.coverage).sum((-2, -1)).cpu()
+    passed = 1.0 if front.passed is None else front.passed
+    area = (front.area * front.coverage * passed).sum((-2, -1)).cpu()
     height = (found.centre - found.centre[0]).norm(dim=-1)
     slopes = torch.deg2rad(scan.fields).tan()
     if distance is not None:

@@ -161,7 +161,8 @@ class Wavefront:
         area: (N, S, S), of the ray's cell, in direction cosines.
         amplitude: (N, S, S), root of the flux per area in direction cosines: amplitude²·area is the
             flux of a whole cell over that of the axial point of the same object plane through the
-            paraxial entrance pupil (see `dolens.diffraction.entrance_beam`).
+            paraxial entrance pupil (see `dolens.diffraction.entrance_beam`), less what a lens with
+            coatings loses.
         coverage: (N, S, S), from 0 to 1: the share of the cell that all apertures pass.
         valid: (N, S, S), bool: the ray reaches the sensor, clipped or not, and so do its
             neighbours.  The others have finite numbers, no coverage and no gradient.
@@ -175,6 +176,8 @@ class Wavefront:
         wavelength: (N,), nm.
         index: (N,), before the sensor.
         landed: (N, S, S, 2), mm, x and y where the rays meet the sensor.
+        passed: (N, S, S), the share of unpolarised light that arrives; None: of a lens without
+            coatings.
     """
 
     opd: Tensor
@@ -192,6 +195,7 @@ class Wavefront:
     wavelength: Tensor
     index: Tensor
     landed: Tensor
+    passed: Tensor | None = None
 
     @property
     def waves(self) -> Tensor:
@@ -289,7 +293,7 @@ def pupil_wavefront(
     q = box_grid(beam.centre, half_width, samples, RIM)
     ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
     rays = Rays.from_components(ray, every)
-    hit = trace_rays(opened, rays)
+    hit = trace_rays(opened, rays, transmission=opened.coated)
     away, arriving = hit.position[..., :2] - centre[:, None, None], hit.direction
     path: Tensor | float = 0.0
     if system.image is not None:
@@ -305,7 +309,10 @@ def pupil_wavefront(
     area = torch.where(valid, cell_areas(direction).clamp(min=_SMALLEST), 1.0)
     cell = (2.0 / samples) ** 2 * half_width.prod(-1) / axial_flux(system, points, waves)
     density = flux_density(points, _inner(q), _inner(ray.n)) * cell[:, None, None] / area
-    amplitude = torch.where(valid, density, 1.0).sqrt()
+    passed = None if hit.transmission is None else _inner(hit.transmission)
+    if passed is not None:
+        density = density * passed
+    amplitude = torch.where(valid & (density > 0.0), density, 1.0).sqrt()
 
     inside = Rays(_inner(rays.position), _inner(rays.direction), every)
     crossings, share = {}, (valid & beam.lit[:, None, None]).to(opd.dtype)
@@ -331,6 +338,7 @@ def pupil_wavefront(
         wavelength=waves,
         index=index,
         landed=_inner(hit.position[..., :2]),
+        passed=passed,
     )
 
 

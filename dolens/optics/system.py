@@ -105,6 +105,17 @@ class OpticalSystem:
         return tuple(n for n in range(1, len(self.surfaces) + 1) if n not in self.breaks)
 
     @cached_property
+    def coated(self) -> bool:
+        """Return whether a surface has a coating, so that light which passes has lost some."""
+        return any(surface.coating is not None for surface in self.surfaces)
+
+    def uncoated(self) -> "OpticalSystem":
+        """Return the same lens, whose surfaces are ideal."""
+        if not self.coated:
+            return self
+        return replace(self, surfaces=[replace(s, coating=None) for s in self.surfaces])
+
+    @cached_property
     def neighbours(self) -> tuple[tuple[int, int], ...]:
         """Return the numbers of surfaces that light meets one after the other."""
         return tuple(zip(self.met, self.met[1:], strict=False))

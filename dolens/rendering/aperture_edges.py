@@ -403,23 +403,28 @@ class _Beam:
         radius, slope = self.refined(radius, still)
         with torch.no_grad():
             beside = _BESIDE[self.system.dtype]
-            inside, passes, other = self._through(radius * (1.0 - beside), still)
+            inside, passes, other, light = self._through(radius * (1.0 - beside), still)
             place = (self.middle + radius[..., None] * self.arms).norm(dim=-1)
             counts = passes & (place < 1.0) & (slope < 0.0) & (radius > 0.0)
             safe = torch.where(slope < 0.0, slope, -1.0)
             share = (still.radius / still.axial_radius) ** 2
             share = share / still.axial_mean(float(self.system.vertices[-1].detach()))
             # cos⁴ of the ray at the sensor, as every sample's.
-            bright = self.rays(radius, still).n ** 4
+            bright = light * self.rays(radius, still).n ** 4
             factor = torch.where(counts, -2.0 * radius * bright * share / safe, 0.0)
         distance = self.distance(radius, self.pupil)
         moved = distance - distance.detach()
         return _Found(inside, factor * moved, counts, other)
 
-    def _through(self, radius: Tensor, pupil: ExitPupil) -> tuple[Components, Tensor, Tensor]:
-        """Rays before the lens, which got there, and the edge that stopped the others, or 0."""
+    def _through(
+        self, radius: Tensor, pupil: ExitPupil
+    ) -> tuple[Components, Tensor, Tensor, Tensor | float]:
+        """Rays before the lens, which got there, the edge that stopped the others, or 0, and the
+        share of light that a lens with coatings passes.
+        """
         rays = Rays.from_components(self.rays(radius, pupil), self.wavelength)
-        hit = trace_rays(self.system, rays, -1.0)
+        hit = trace_rays(self.system, rays, -1.0, transmission=self.system.coated)
         there = hit.components()
         clipped = torch.where(hit.status == Status.VIGNETTED, hit.surface.long(), 0)
-        return there, hit.valid & (there.n < 0.0), clipped
+        light = 1.0 if hit.transmission is None else hit.transmission
+        return there, hit.valid & (there.n < 0.0), clipped, light

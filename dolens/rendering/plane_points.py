@@ -100,17 +100,21 @@ def pupil_rays(
 
     Returns:
         The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
-        that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.
+        that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.  Of
+        a lens with coatings they are less, by what it loses.
     """
     system, pupil = imaging.system, imaging.pupil
     sensor_z = system.vertices[-1]
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
     disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
     ray = rays_to_exit_pupil(x, y, sensor_z, disc_x, disc_y, pupil.z)
-    there, valid = _before_the_lens(system, ray, imaging.scene.wavelengths)
+    there, valid, passed = _before_the_lens(system, ray, imaging.scene.wavelengths)
     share = (pupil.radius / pupil.axial_radius) ** 2
     share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
-    return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+    light = ray.n**4 * share
+    if passed is not None:
+        light = light * passed
+    return there, torch.where(valid & (there.n < 0.0), light, 0.0)
 
 
 def rim_rays(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> EdgeRays | None:
@@ -205,9 +209,9 @@ def _rounded(radius: Tensor) -> Tensor:
 
 def _before_the_lens(
     system: OpticalSystem, ray: Components, wavelengths: Sequence[float]
-) -> tuple[Components, Tensor]:
-    """Rays (C, N, S) in object space, and which of them got there."""
+) -> tuple[Components, Tensor, Tensor | None]:
+    """Rays (C, N, S) in object space, which of them got there, and their shares of light."""
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, every[:, None, None])
-    hit = trace_rays(system, rays, -1.0)
-    return hit.components(), hit.valid
+    hit = trace_rays(system, rays, -1.0, transmission=system.coated)
+    return hit.components(), hit.valid, hit.transmission

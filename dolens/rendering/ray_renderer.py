@@ -42,6 +42,7 @@ from dolens.rendering.exit_pupil import (
 )
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import Renderer, SensorWindow
+from dolens.rendering.relative_illumination import transmission_map
 from dolens.rendering.sampling import random_words, square_to_disc, stratified_square, uniform
 from dolens.scene.scene import Scene, texture_coordinates, texture_origin
 from dolens.sensor.noise import generator_of
@@ -55,7 +56,8 @@ class RayRenderer(Renderer):
     Each pixel sends `pupil_samples`² rays: one from a random point of the pixel through a random
     point of each stratum of the exit pupil.  All wavelengths share the samples.  The irradiance
     of a pixel is the mean over the pupil of radiance · cos⁴, relative to the axis, so that a white
-    plane renders white on the axis and falls off where the lens does.
+    plane renders white on the axis and falls off where the lens does.  A lens with coatings makes
+    it darker, by the mean over the pupil of what passes (see `transmission_map`).
 
     Attributes:
         sensor: the pixels.
@@ -142,13 +144,31 @@ class RayRenderer(Renderer):
         Raises:
             InputError: a depth inside the lens, or channels that are not the scene's.
         """
+        image = self._ideal_image(lens, scene, textures, seed, axial)
+        coated = lens.system()
+        if not coated.coated:
+            return image
+        pupil = sampled_exit_pupil(coated, scene.wavelengths, self.sensor, axial).numbers()
+        passed = transmission_map(ImagingSystem(coated, scene, self.sensor, pupil))
+        return image if passed is None else image * passed.to(image)
+
+    def _ideal_image(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        seed: int,
+        axial: ExitPupil | None,
+    ) -> Tensor:
+        """Return the image of a lens that loses no light; arguments are those of `render`."""
         stored = {n: p for n, p in lens.named_parameters() if p.requires_grad}
         parameters = {**stored, **lens.given}
         textures = textures.to(device=lens.device, dtype=lens.dtype)
         shown = scene.on_planes(textures)
-        system = with_chosen_backend(lens.system(parameters), [textures])
+        system = with_chosen_backend(lens.system(parameters).uncoated(), [textures])
         backend = system.backend
-        now = lens.system({n: p.detach() for n, p in parameters.items()}).traced_by(backend)
+        still = lens.system({n: p.detach() for n, p in parameters.items()}).uncoated()
+        now = still.traced_by(backend)
         scene.check(now)
         pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, axial)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)
@@ -167,7 +187,7 @@ class RayRenderer(Renderer):
             """The lens, the view and what planes show, from a piece's own tensors."""
             values = dict(zip(names, tensors[planes:-1], strict=True))
             return (
-                lens.system(values).traced_by(backend),
+                lens.system(values).uncoated().traced_by(backend),
                 moving.of(tensors[-1]),
                 tuple(tensors[:planes]),
             )

@@ -1,6 +1,7 @@
 """Relative illumination: how bright a white scene is over the sensor."""
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -82,6 +83,20 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
     return functional.interpolate(
         light[None], size=(height, width), mode="bicubic", align_corners=True
     )[0]
+
+
+def transmission_map(imaging: ImagingSystem, rays: int = 256) -> Tensor | None:
+    """Return the share of light that a lens with coatings passes to every pixel, (C, height,
+    width), the mean over the pupil; None of a lens without coatings.
+
+    Differentiable in the lens and its coatings.  Arguments are those of `relative_illumination`.
+    """
+    if not imaging.system.coated:
+        return None
+    ideal = relative_illumination(replace(imaging, system=imaging.system.uncoated()), rays)
+    found = relative_illumination(imaging, rays)
+    dark = ideal <= 0.0
+    return torch.where(dark, 1.0, found / torch.where(dark, 1.0, ideal))
 
 
 class IlluminationMap(NamedTuple):
