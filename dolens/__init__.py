@@ -55,6 +55,7 @@ _VIEWS = (
         "lateral_colour",
         "mtf",
         "photograph",
+        "polarisation",
         "psf",
     ),
     *(

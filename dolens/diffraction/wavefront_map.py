@@ -103,7 +103,7 @@ def wavefront_maps(lens: Lens, where: Conditions, samples: int = 64) -> Wavefron
         middle = light_centroids(system, points, wave, beam)
         centre = torch.where(reached[:, None], centre, middle)
     front = pupil_wavefront(system, points, wave, centre, samples, beam=beam)
-    stop, cell = _stop_coordinates(system, points, wave, beam, samples)
+    stop, cell = stop_coordinates(system, points, wave, beam, samples)
     weight = (cell * front.coverage).where(front.valid & stop.isfinite().all(-1), 0.0)
     weight = weight / weight.sum((-2, -1), keepdim=True)
     weight = weight.nan_to_num(0.0)
@@ -123,7 +123,7 @@ def wavefront_maps(lens: Lens, where: Conditions, samples: int = 64) -> Wavefron
     )
 
 
-def _stop_coordinates(
+def stop_coordinates(
     system: OpticalSystem, points: ObjectPoints, wave: Tensor, beam: EntranceBeam, samples: int
 ) -> tuple[Tensor, Tensor]:
     """Return where the rays of `pupil_wavefront` cross the stop over its semi-diameter,

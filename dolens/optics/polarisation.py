@@ -97,19 +97,21 @@ class PolarisedRays:
 def double_pole_axes(direction: Tensor, pole: Tensor) -> Tensor:
     """Return axes across rays by Chipman's double-pole coordinates, (..., 3, 2).
 
-    The lens's x and y, turned along great circles from z to the pole and from there to the ray.
-    They have no singularity but opposite to the pole.  Where the pole points towards -z, x and y
-    come there from -z, and x × y is against the light.
+    They are the lens's x and y, turned along great circles from z to the pole and from there to
+    the ray; there is no singularity but opposite to the pole.  x × y is along the light: where it
+    goes towards -z, y is turned over first.
 
     Args:
         direction: (..., 3), unit vectors.
-        pole: (..., 3), unit vector that the axes turn about as little as they can: the direction of
-            the chief ray.
+        pole: (..., 3), unit vectors that the axes turn about as little as they can.
     """
-    start = torch.zeros_like(pole)
-    start[..., 2] = 1.0 - 2.0 * (pole[..., 2].detach() < 0.0).to(pole.dtype)
-    x, y = (torch.eye(3, dtype=pole.dtype, device=pole.device)[i] for i in (0, 1))
-    found = [turned(turned(axis, start, pole), pole, direction) for axis in (x, y)]
+    sign = 1.0 - 2.0 * (pole[..., 2:].detach() < 0.0).to(pole.dtype)
+    x, y, z = torch.eye(3, dtype=pole.dtype, device=pole.device)
+    start = sign * z
+    found = [
+        turned(turned(axis, start, pole), pole, direction)
+        for axis in (x.expand_as(start), sign * y)
+    ]
     return torch.stack(found, -1)
 
 
@@ -280,12 +282,13 @@ def _to_lens(crossing: Crossing, direction: Vector) -> Vector:
 
 
 def _axes_across(k: Vector) -> tuple[Vector, Vector]:
-    """Return two axes across rays that do not run along -z, or not along +z: x and y, turned."""
+    """Return two axes across rays, x and y turned from z, or x and -y from -z."""
     x, y, z = k
     sign = torch.where(z.detach() < 0.0, -1.0, 1.0).to(z.dtype)
     a = 1.0 / (1.0 + sign * z)
     cross = -x * y * a
-    return (1.0 - x * x * a, cross, -sign * x), (cross, 1.0 - y * y * a, -sign * y)
+    second = (sign * cross, sign * (1.0 - y * y * a), -y)
+    return (1.0 - x * x * a, cross, -sign * x), second
 
 
 def _dot(a: Vector, b: Vector) -> Tensor:

@@ -14,9 +14,12 @@ from dolens.views.ghosts import GhostViews
 from dolens.views.image_quality import ImageQualityViews
 from dolens.views.overview import OverviewViews
 from dolens.views.photographs import PhotographViews
+from dolens.views.polarisation import PolarisationViews
 
 
-class LensViews(OverviewViews, ImageQualityViews, GhostViews, DesignViews, PhotographViews):
+class LensViews(
+    OverviewViews, ImageQualityViews, PolarisationViews, GhostViews, DesignViews, PhotographViews
+):
     """Methods of `Lens` that show it.
 
     Arguments that all of them share:
