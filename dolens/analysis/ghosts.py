@@ -258,7 +258,7 @@ def ghost_light(
     system, catching = with_losses(lens.system()), sensor_aperture(lens)
     sensor = len(system.surfaces) + 1
     for wave, share in zip(where.wavelengths.tolist(), where.weights.tolist(), strict=True):
-        front = front_rays(lens, where, wave, rays)
+        front = front_rays(system, where, wave, rays)
         if not len(front.weight):
             field = tuple(where.fields[0].tolist())
             raise InputError(f"ghosts: no light of field {field} enters the front surface")
@@ -289,24 +289,26 @@ def sensor_aperture(lens: Lens) -> ClearAperture:
     return ClearAperture(Circle(0.5 * diameter)) if diameter else WITHOUT_EDGE
 
 
-def front_rays(lens: Lens, where: Conditions, wavelength: float, count: int) -> FrontRays:
+@torch.no_grad()
+def front_rays(
+    system: OpticalSystem, where: Conditions, wavelength: float, count: int
+) -> FrontRays:
     """Launch rays of an object point that fill the front surface.
 
     They come in the order of how far they get on the image's path, so that those that reach a
     surface are the first so many.
 
     Args:
-        lens: in double precision.
+        system: the lens.
         where: the field is its first; and object distance.
         wavelength: nm.
         count: of rays, before the front surface takes some.
     """
-    system = lens.system()
-    field = where.fields[0].to(lens.device)
+    field = where.fields[0].to(system.device)
     infinite = where.object_distance is None
     line, near = field_line(torch.deg2rad(field) if infinite else field, where.object_distance)
     low, high = front_box(system, line, float(near))
-    k = torch.arange(count, dtype=torch.float64, device=lens.device)[:, None]
+    k = torch.arange(count, dtype=torch.float64, device=system.device)[:, None]
     lattice = (0.5 + k * torch.tensor(_STEPS).to(k)).frac()
     q = low + lattice * (high - low)
     ray = launch(line, near, q)

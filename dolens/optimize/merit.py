@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -96,6 +96,7 @@ def evaluate_operands(
     lens: Lens,
     object_distance: float | None,
     crossings: dict[tuple[float, float], Tensor] | None = None,
+    ghost_rays: dict[Any, Any] | None = None,
 ) -> OperandValues:
     """Evaluate operands of a lens.
 
@@ -106,6 +107,7 @@ def evaluate_operands(
         object_distance: mm in front of the first vertex; None for infinity.
         crossings: where chief rays crossed the front at an earlier point, from which their aiming
             begins; this point's are stored in it.  None: aiming begins anew.
+        ghost_rays: which rays make ghosts, as an earlier point chose them; None: chosen anew.
 
     Raises:
         UnreachableField: the chief ray of an operand's field does not reach the stop.
@@ -117,6 +119,7 @@ def evaluate_operands(
         lens.primary_wavelength,
         object_distance,
         {} if crossings is None else crossings,
+        {} if ghost_rays is None else ghost_rays,
     )
     found = [
         (operand, label, value)
@@ -255,6 +258,7 @@ class MeritFunction:
             # Landing points are linear in the distance of a plane alone.
             require_plane_sensor(lens.system(), "variable 'sensor_distance': solve 'best_focus'")
         self.crossings: dict[tuple[float, float], Tensor] = {}
+        self.ghost_rays: dict[Any, Any] = {}
         self._last: tuple[Tensor, MeritValue] | None = None
 
     @property
@@ -400,6 +404,8 @@ def _operands(merit: MeritFunction, sensor_distance: Tensor | None = None) -> Op
     if sensor_distance is not None:
         lens = lens.with_values({"sensor_distance": sensor_distance})
     try:
-        return evaluate_operands(merit.operands, lens, lens.object_distance, merit.crossings)
+        distance = lens.object_distance
+        kept = merit.crossings, merit.ghost_rays
+        return evaluate_operands(merit.operands, lens, distance, *kept)
     except UnreachableField:
         return None

@@ -61,12 +61,14 @@ class LensProperties:
         object_distance: mm in front of the first vertex; None for an object at infinity.
         crossings: where chief rays crossed the front at an earlier point; this point's are stored
             there for the next.
+        ghost_rays: which rays made ghosts at the first point; see `ghost_operands`.
     """
 
     system: OpticalSystem
     wavelength: float
     object_distance: float | None
     crossings: dict[tuple[float, float], Tensor] = dataclass_field(default_factory=dict)
+    ghost_rays: dict[Any, Any] = dataclass_field(default_factory=dict)
     _chief_rays: dict[tuple[float, float], Components] = dataclass_field(default_factory=dict)
 
     @cached_property
@@ -361,6 +363,9 @@ def _labelled(operand: Operand) -> str:
 
 # Kinds with more settings: their classes, loaded when one is asked for.
 CLASSES = {
+    "ghost_focus": "dolens.optimize.ghost_operands.GhostFocus",
+    "ghost_rms": "dolens.optimize.ghost_operands.GhostRMS",
+    "log_ghost_irradiance": "dolens.optimize.ghost_operands.LogGhostIrradiance",
     "reflectance": "dolens.optimize.light_operands.Reflectance",
     "transmission": "dolens.optimize.light_operands.TransmissionOfChiefRay",
 }

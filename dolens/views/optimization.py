@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.text_tables import html_table, printable, text_table
 from dolens.optimize.merit import evaluate_operands
-from dolens.optimize.operands import KINDS, Operand, operand
+from dolens.optimize.operands import CLASSES, KINDS, Operand, operand
 from dolens.optimize.rounds import Design
 
 if TYPE_CHECKING:
@@ -334,7 +334,7 @@ def operands_to_keep(
         raise InputError(f"keep: {keep!r}; allowed: operands with targets, as {{'efl': 50}}")
     found: dict[str, Operand] = {}
     for name, wanted in keep.items():
-        check_choice(name, (*KINDS, *_OTHER_NAMES), "keep")
+        check_choice(name, (*KINDS, *CLASSES, *_OTHER_NAMES), "keep")
         kind = _OTHER_NAMES.get(name, name)
         if kind in found:
             raise InputError(f"keep: '{name}' is named twice")
@@ -353,7 +353,8 @@ def operands_to_keep(
 def _settings(name: str, wanted: Wanted) -> dict[str, Any]:
     """Return a target, limits or settings as settings of an operand."""
     if isinstance(wanted, Mapping):
-        check_keys(wanted, _KEYS, f"keep: {name}")
+        if name not in CLASSES:  # which have keys of their own
+            check_keys(wanted, _KEYS, f"keep: {name}")
         return dict(wanted)
     if isinstance(wanted, int | float) and not isinstance(wanted, bool):
         return {"target": wanted}
