@@ -296,6 +296,7 @@ def a_design(keys, name="cooke_triplet"):
 FRAGMENTS = {
     "docs/coatings.md: coating: quarter_wave": a_lens,
     "docs/conventions.md: '3': {type: coordinate_break": a_lens,
+    "docs/ghosts.md: variables:": partial(a_design, name="double_gauss"),
     "docs/glass.md: temperature: 60": a_lens,
     "docs/glass.md: surfaces:": a_lens,
     "docs/least_squares.md: variables:": a_design,
