@@ -103,11 +103,11 @@ def huygens_point_spread(
             continue
         which = number * len(weights) + torch.arange(len(weights), device=lens.device)
         front = part_of(found.wavefront, which)
-        half = 1e-3 * half_width_um if half_width_um else _half_width(front, weights)
+        half = 1e-3 * half_width_um if half_width_um else half_width_of(front, weights)
         field = where.fields[number].to(weights).expand(len(weights), 2)
         points = object_points(field, where.object_distance)
         sums = _Wavelets(lens, points, front, weights, half)
-        finer = sums.rays(rays, cells)
+        finer = rays_for(front, half, rays, cells)
         grid = (torch.arange(cells).to(weights) + 0.5) * (2.0 * half / cells) - half
         irradiance, perfect = sums.added(finer, grid, grid)
         coarser = sums.added(max(8, round(COARSER * finer)), grid, grid)[0]
@@ -132,11 +132,39 @@ def huygens_window(lens: Lens, where: Conditions) -> tuple[float, float]:
     airy = airy_radius_um(lens, where)
     if not bool(found.lit.any()):
         return airy, airy
-    return 1e3 * _half_width(found.wavefront, where.weights.to(lens.device)), airy
+    return 1e3 * half_width_of(found.wavefront, where.weights.to(lens.device)), airy
 
 
-def _half_width(front: Wavefront, weights: Tensor) -> float:
+def half_width_of(front: Wavefront, weights: Tensor) -> float:
+    """Return the half width (mm) of a window that holds the light of W wavefronts of a field."""
     return window_half_width(FieldPupil(front, weights, None, ""))
+
+
+def rays_for(front: Wavefront, half: float, given: int | None, cells: int) -> int:
+    """Return the rays along each side of a box about each beam, for a window of one field.
+
+    Args:
+        front: of W wavelengths.
+        half: half width of the window, mm.
+        given: by a user; None: so many that the phases of neighbours differ by half a turn at most.
+        cells: along each side of the window.
+
+    Raises:
+        InputError: too few are given, or more are needed than can be added up.
+    """
+    needed = math.ceil(_HALF_TURNS * turns_across(front, half))
+    chosen = given or max(_FEWEST, 4 * math.ceil(needed / 4.0))
+    if chosen < needed:
+        raise InputError(
+            f"{chosen} rays along each side are too few for this window: phases of neighbours "
+            f"differ by more than half a turn; give {needed} or more, or a smaller window"
+        )
+    if len(front.wavelength) * chosen**2 * cells**2 > _MOST_PAIRS:
+        raise InputError(
+            f"{chosen} × {chosen} rays to {cells} × {cells} points are too many to add up; "
+            "give fewer cells or a smaller window, or look at the rays alone"
+        )
+    return chosen
 
 
 class _Wavelets:
@@ -152,26 +180,6 @@ class _Wavelets:
     ) -> None:
         self.system, self.points, self.front = lens.system(), points, front
         self.weights, self.half = weights, half
-
-    def rays(self, given: int | None, cells: int) -> int:
-        """Return the rays along each side.
-
-        Raises:
-            InputError: too few are given, or more are needed than can be added up.
-        """
-        needed = math.ceil(_HALF_TURNS * turns_across(self.front, self.half))
-        chosen = given or max(_FEWEST, 4 * math.ceil(needed / 4.0))
-        if chosen < needed:
-            raise InputError(
-                f"{chosen} rays along each side are too few for this window: phases of neighbours "
-                f"differ by more than half a turn; give {needed} or more, or a smaller window"
-            )
-        if len(self.weights) * chosen**2 * cells**2 > _MOST_PAIRS:
-            raise InputError(
-                f"{chosen} × {chosen} rays to {cells} × {cells} points are too many to add up; "
-                "give fewer cells or a smaller window, or look at the rays alone"
-            )
-        return chosen
 
     def highest(self, rays: int, grid: Tensor, irradiance: Tensor) -> float:
         """Return the highest irradiance, 1/mm²: on a grid of steps that no peak slips through, and

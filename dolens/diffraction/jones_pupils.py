@@ -12,13 +12,19 @@ that by the same lens with ideal surfaces, along the same rays.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
-from dolens.diffraction.entrance_beam import box_grid, find_beam, launched
+from dolens.diffraction.entrance_beam import (
+    EntranceBeam,
+    ObjectPoints,
+    box_grid,
+    find_beam,
+    launched,
+)
 from dolens.diffraction.field_wavefronts import light_centroids, object_points
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.diffraction.wavefront_map import stop_coordinates
@@ -30,9 +36,10 @@ from dolens.optics.jones import (
     retardance,
 )
 from dolens.optics.lens import Lens
-from dolens.optics.polarisation import double_pole_axes, trace_polarised
+from dolens.optics.polarisation import PolarisedRays, double_pole_axes, trace_polarised
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
 
 
 @dataclass(frozen=True)
@@ -146,21 +153,10 @@ def jones_pupils(
     light = (wavefront.amplitude * wavefront.weight).where(stop.isfinite().all(-1), 0.0)
     light = (light / light.sum((-2, -1), keepdim=True)).nan_to_num(0.0)
 
-    half_width = beam.half_width * (samples / (samples - 2.0))
-    ray = launched(points, box_grid(beam.centre, half_width, samples))
-    # Rays without light may take long to miss.
-    lit = light > 0.0
-    owner = torch.nonzero(lit)[:, 0]
-    rays = Rays.from_components(Components(*(c[lit] for c in ray)), wave[owner])
-    opened = system.opened()
-    traced = trace_polarised(opened, rays)
-    axes = [
-        double_pole_axes(way, _mean_directions(way, light[lit], owner, len(points))[owner])
-        for way in (traced.front[..., 2], traced.behind[..., 2])
-    ]
+    lit, _, rays, traced, axes = polarised_pupil(system, points, wave, beam, light)
     # Behind ideal surfaces the axes in front are where geometry carries them.
     turn = (traced.front[..., :2].mT @ axes[0]).to(traced.jones)
-    scalar = trace_rays(opened, rays, transmission=True).transmission
+    scalar = trace_rays(system.opened(), rays, transmission=True).transmission
     assert scalar is not None  # it was asked for
 
     def found(values: Tensor) -> Tensor:
@@ -182,6 +178,51 @@ def jones_pupils(
         (over_pupil(scalar) * found(light)).sum((-2, -1)),
     )
     return pupils.between(front, behind)
+
+
+class PolarisedPupil(NamedTuple):
+    """The M rays of N pupils that carry light are traced with their fields.
+
+    Attributes:
+        lit: (N, S, S), bool: they.
+        owner: (M,): number of the pupil.
+        rays: in front of the lens.
+        traced: behind it.
+        axes: (M, 3, 2) in front and behind: double-pole axes about the mean direction there.
+    """
+
+    lit: Tensor
+    owner: Tensor
+    rays: Rays
+    traced: PolarisedRays
+    axes: tuple[Tensor, Tensor]
+
+
+def polarised_pupil(
+    system: OpticalSystem, points: ObjectPoints, wave: Tensor, beam: EntranceBeam, light: Tensor
+) -> PolarisedPupil:
+    """Trace the rays of `pupil_wavefront` that carry light, and the field along them.
+
+    Args:
+        system: the lens, in double precision.
+        points: N object points.
+        wave: (N,), nm.
+        beam: of these points.
+        light: (N, S, S), flux of each ray; the others are not traced.
+    """
+    samples = light.shape[-1]
+    half_width = beam.half_width * (samples / (samples - 2.0))
+    ray = launched(points, box_grid(beam.centre, half_width, samples))
+    # Rays without light may take long to miss.
+    lit = light > 0.0
+    owner = torch.nonzero(lit)[:, 0]
+    rays = Rays.from_components(Components(*(c[lit] for c in ray)), wave[owner])
+    traced = trace_polarised(system.opened(), rays)
+    front, behind = (
+        double_pole_axes(way, _mean_directions(way, light[lit], owner, len(points))[owner])
+        for way in (traced.front[..., 2], traced.behind[..., 2])
+    )
+    return PolarisedPupil(lit, owner, rays, traced, (front, behind))
 
 
 def _mean_directions(direction: Tensor, light: Tensor, owner: Tensor, count: int) -> Tensor:
