@@ -7,11 +7,12 @@ import math
 from collections.abc import Mapping
 from decimal import Context, Decimal
 from fractions import Fraction
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from dolens.errors import InputError, comma_hint
+
+if TYPE_CHECKING:
+    import torch
 
 
 def as_number(value: object, what: str, finite: bool = True) -> float:
@@ -63,11 +64,23 @@ def require_mapping(value: object, where: str) -> None:
         raise InputError(f"{where}: expected a mapping of keys to values, not {value!r}")
 
 
+def power_of(focal_length: object) -> float:
+    """Return one over a focal length (mm), which may be infinite.
+
+    Raises:
+        InputError: it is no number, or zero.
+    """
+    length = as_number(focal_length, "'focal_length'", finite=False)
+    if length == 0.0:
+        raise InputError("'focal_length' is 0; write .inf for a lens without power")
+    return 1.0 / length
+
+
 # Keys whose text is no number, even where it reads like one; states are lenses of their own.
 _WORDS = ("name", "note", "source", "published", "states")
 
 
-def check_range(value: object, dtype: torch.dtype, where: str, key: str = "") -> None:
+def check_range(value: object, dtype: "torch.dtype", where: str, key: str = "") -> None:
     """Refuse numbers of a prescription that the precision of a lens cannot hold.
 
     Those are finite numbers beyond its largest, and curvatures whose squares, which sags have, are.
@@ -100,6 +113,8 @@ def check_range(value: object, dtype: torch.dtype, where: str, key: str = "") ->
         number = abs(float(value))  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return  # no number: for others to use or to refuse
+    import torch  # here alone: what reads plain values need not wait for it
+
     most = torch.finfo(dtype).max
     if key.startswith("curvature"):
         most = math.sqrt(most)

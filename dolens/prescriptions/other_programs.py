@@ -7,8 +7,7 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 from dolens.errors import InputError
-from dolens.prescriptions.numbers import as_number, nearest, number_in_text, scaled
-from dolens.prescriptions.row_data import power_of
+from dolens.prescriptions.numbers import as_number, nearest, number_in_text, power_of, scaled
 
 ALWAYS = "always"
 # Coefficients of rotational powers, Forbes's and Zernike's polynomials, phases, and monomials.

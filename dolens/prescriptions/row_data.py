@@ -56,6 +56,7 @@ from dolens.prescriptions.numbers import (
     as_positive,
     curvature_from,
     curvature_row,
+    power_of,
     require_mapping,
 )
 
@@ -196,18 +197,6 @@ def with_power(row: Mapping[str, Any]) -> Mapping[str, Any]:
     if row.get("power") is not None:
         raise InputError("give 'focal_length' or 'power', not both")
     return {**without(row, "focal_length"), "power": power_of(row["focal_length"])}
-
-
-def power_of(focal_length: object) -> float:
-    """Return one over a focal length (mm), which may be infinite.
-
-    Raises:
-        InputError: it is no number, or zero.
-    """
-    length = as_number(focal_length, "'focal_length'", finite=False)
-    if length == 0.0:
-        raise InputError("'focal_length' is 0; write .inf for a lens without power")
-    return 1.0 / length
 
 
 def power_row(power: float) -> dict[str, float]:

@@ -17,9 +17,9 @@ from dolens.optics.surfaces.zernike_phase import (
     ZernikePhase,
     ZernikeStandardPhase,
 )
-from dolens.prescriptions.numbers import as_number
+from dolens.prescriptions.numbers import as_number, power_of
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
-from dolens.prescriptions.row_data import BREAK_KIND, power_of
+from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
 from dolens.prescriptions.zemax.table import (
     CONIC,
