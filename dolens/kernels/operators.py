@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from dolens.errors import InputError
-from dolens.kernels.table import SurfaceTable
+from dolens.kernels.table import LossTable, SurfaceTable
 
 _library = torch.library.Library("dolens", "DEF")
 
@@ -187,6 +187,116 @@ def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
     )
 
 
+@operator
+def trace_losses(
+    values: Tensor,
+    indices: Tensor,
+    numbers: Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    codes: Tensor,
+    extras: Tensor,
+    steps: Tensor,
+    series: int,
+    absorbs: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Carry rays that lose light through a `SurfaceTable`; see `trace`.
+
+    Args:
+        numbers: of a `LossTable`, and `steps`, `series` and `absorbs`.
+
+    Returns:
+        What `trace` does, and the share of light that is left (N,).
+    """
+    table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
+    losses = LossTable(numbers.contiguous(), steps, series, absorbs)
+    return kernels_of(position).trace(table, position, direction, which, losses=losses)
+
+
+def _trace_losses_shapes(values, indices, numbers, position, *others):  # noqa: ANN001, ANN002, ANN202
+    found = _trace_shapes(values, indices, position, *others[:4])
+    return (*found, position.new_empty(position.shape[0]))
+
+
+@operator
+def trace_losses_adjoint(
+    values: Tensor,
+    indices: Tensor,
+    numbers: Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    codes: Tensor,
+    extras: Tensor,
+    steps: Tensor,
+    series: int,
+    absorbs: bool,
+    status: Tensor,
+    of_position: Tensor | None,
+    of_direction: Tensor | None,
+    of_path: Tensor | None,
+    of_share: Tensor | None,
+    wanted: list[bool],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return the cotangents of values, indices, numbers, position and direction.
+
+    `wanted`: of position, direction, indices and numbers; what is not comes back empty, or zero.
+    """
+    table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
+    losses = LossTable(numbers.contiguous(), steps, series, absorbs)
+    position_gradient, direction_gradient, sums = kernels_of(position).sweep(
+        *(table, position, direction, which, status),
+        (of_position, of_direction, of_path, of_share),
+        (wanted[0], wanted[1], wanted[2]),
+        losses=losses,
+        of_losses=wanted[3],
+    )
+    empty = position.new_empty((0, 3))
+    of_values, of_indices, of_numbers = sums.split(
+        [values.numel(), indices.numel(), numbers.numel()]
+    )
+    return (
+        of_values.to(values.dtype, copy=True),
+        of_indices.reshape(indices.shape).clone(),
+        of_numbers.clone(),
+        empty if position_gradient is None else position_gradient,
+        empty.clone() if direction_gradient is None else direction_gradient,
+    )
+
+
+def _trace_losses_adjoint_shapes(values, indices, numbers, position, *others):  # noqa: ANN001, ANN002, ANN202
+    of_values, of_indices, *of_rays = _trace_adjoint_shapes(values, indices, position, *others)
+    return of_values, of_indices, torch.empty_like(numbers), *of_rays
+
+
+def _setup_losses(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    *tensors, ctx.series, ctx.absorbs = inputs
+    _setup(ctx, tuple(tensors), output)
+
+
+def _backward_losses(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    *inputs, status = ctx.saved_tensors
+    given = (*gradients[:3], gradients[5])
+    if all(g is None for g in given):
+        return (None,) * 11
+    needs = ctx.needs_input_grad
+    wanted = [needs[3], needs[4], needs[1], needs[2]]
+    of_values, of_indices, of_numbers, of_position, of_direction = trace_losses_adjoint(
+        *inputs, ctx.series, ctx.absorbs, status, *given, wanted
+    )
+    return (
+        *(of_values, of_indices, of_numbers),
+        of_position if wanted[0] else None,
+        of_direction if wanted[1] else None,
+        *(None,) * 6,
+    )
+
+
+register_shapes("trace_losses", _trace_losses_shapes)
+register_derivative("trace_losses", _backward_losses, _setup_losses)
+register_shapes("trace_losses_adjoint", _trace_losses_adjoint_shapes)
+forbid_derivative("trace_losses_adjoint")
 register_shapes("trace", _trace_shapes)
 register_derivative("trace", _backward, _setup)
 register_shapes("trace_adjoint", _trace_adjoint_shapes)

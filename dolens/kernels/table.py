@@ -149,6 +149,45 @@ class SurfaceTable:
         return SurfaceTable(self.values[None], self.indices[None], self.codes, self.extras)
 
 
+class Cosine(IntEnum):
+    """The power that a surface passes is a series in the cosine of incidence that is taken here.
+
+    It is smooth in the cosine of the medium of the lower index, up to grazing light: in the other
+    medium it has the root of the critical angle.
+    """
+
+    ARRIVING = 0  # in the medium in front
+    LEAVING = 1  # in the medium behind
+    # At a mirror: in the medium beyond it, by Snell's law; zero past the critical angle.
+    BEYOND = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LossTable:
+    """The losses of light at a table's steps and between them.
+
+    Attributes:
+        numbers: float64, contiguous: the absorption (media, wavelengths), 1/mm, with the rows of
+            `SurfaceTable.indices`; of S steps the ratios (S, wavelengths), of the index in front to
+            that beyond; 2/(1 - lowest cosine u_0) of each, s (S,); the coefficients (S,
+            wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 4; then the same series
+            again, and its derivative with respect to u, as the kernels sum them: up to `POWERS` as
+            powers of x, and more as T_k.
+        steps: (steps, 2), int64, on the CPU: which of the S, in their order, a step has, or -1;
+            and a `Cosine`.
+        series: S.
+        absorbs: whether any medium does.
+    """
+
+    numbers: Tensor
+    steps: Tensor
+    series: int
+    absorbs: bool
+
+
+# A series of more coefficients is not summed by powers, which would lose single precision's digits.
+POWERS = 16
+
 # Outputs that can be differentiated, and where they lie among the numbers that the kernels keep of
 # a ray, and so where their cotangents are one.
 OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}

@@ -17,19 +17,20 @@ from torch import Tensor
 from dolens.cached_tensors import cached_tensors
 from dolens.kernels import operators
 from dolens.kernels.operators import are_plain, is_eager, kernels_of
-from dolens.kernels.table import SurfaceTable
+from dolens.kernels.table import LossTable, SurfaceTable
 from dolens.optics.packing import LaidOut, cotangents_of_numbers, packed_values, record_indices
 from dolens.optics.records import Records
 
-Traced = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+# Position, direction, path length, status and surface; with losses the share of light, too.
+Traced = tuple[Tensor, ...]
 
 
-def traces_eagerly(found: LaidOut, wavelength: float | Tensor, *rays: Tensor) -> bool:
+def traces_eagerly(found: LaidOut, wavelength: float | Tensor, *tensors: Tensor) -> bool:
     """Return whether `trace_eagerly` can trace these rays: on the CPU, where nobody looks on."""
-    if rays[0].device.type != "cpu":
+    if tensors[0].device.type != "cpu":
         return False
     waves = (wavelength,) if isinstance(wavelength, Tensor) else ()
-    return is_eager((*rays, *waves, *found.arrays)) and are_plain(found.scalars)
+    return is_eager((*tensors, *waves, *found.arrays)) and are_plain(found.scalars)
 
 
 def trace_eagerly(
@@ -38,6 +39,7 @@ def trace_eagerly(
     position: Tensor,
     direction: Tensor,
     which: Tensor | None,
+    losses: LossTable | None = None,
 ) -> Traced:
     """Carry rays through a lens; see `operators.trace`.
 
@@ -47,12 +49,17 @@ def trace_eagerly(
         position: (N, 3), mm, in the lens's precision.
         direction: (N, 3), unit vectors.
         which: (N,), int32: each ray's wavelength, or None where there is one.
+        losses: at the lens's steps, or None.
     """
     indices = eager_indices(found, wavelength)
     inputs = (indices, position, direction, *found.scalars, *found.arrays)
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-        return _Trace.apply(found, which, *inputs)
-    return _traced(found, eager_table(found, indices), position, direction, which)
+    numbers = None if losses is None else losses.numbers
+    if torch.is_grad_enabled() and (
+        any(tensor.requires_grad for tensor in inputs)
+        or (numbers is not None and numbers.requires_grad)
+    ):
+        return _Trace.apply(found, which, losses, numbers, *inputs)
+    return _traced(found, eager_table(found, indices), position, direction, which, losses)
 
 
 def trace_by_operator(
@@ -61,12 +68,18 @@ def trace_by_operator(
     position: Tensor,
     direction: Tensor,
     which: Tensor | None,
+    losses: LossTable | None = None,
 ) -> Traced:
     """Carry rays through a lens as `trace_eagerly` does, by operations that PyTorch sees."""
     values = packed_values(found.layout, found.scalars, found.arrays)
     indices = record_indices(found, wavelength, position.device)
     codes, extras = found.layout.codes, found.layout.extras
-    return operators.trace(values, indices, position, direction, which, codes, extras)
+    if losses is None:
+        return operators.trace(values, indices, position, direction, which, codes, extras)
+    return operators.trace_losses(
+        *(values, indices, losses.numbers, position, direction, which, codes, extras),
+        *(losses.steps, losses.series, losses.absorbs),
+    )
 
 
 class _Trace(torch.autograd.Function):
@@ -77,6 +90,8 @@ class _Trace(torch.autograd.Function):
         ctx: Any,
         found: LaidOut,
         which: Tensor | None,
+        losses: LossTable | None,
+        of_losses: Tensor | None,
         indices: Tensor,
         position: Tensor,
         direction: Tensor,
@@ -84,45 +99,58 @@ class _Trace(torch.autograd.Function):
     ) -> Traced:
         """Trace, and keep the rays and the lens's records."""
         table = eager_table(found, indices)
-        traced = _traced(found, table, position, direction, which)
-        status, surface = traced[3:]
+        traced = _traced(found, table, position, direction, which, losses)
+        status, surface = traced[3:5]
         ctx.mark_non_differentiable(status, surface)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(table.values, indices, position, direction, which, status)
-        ctx.found, ctx.numbers = found, numbers
+        ctx.save_for_backward(table.values, indices, position, direction, which, status, of_losses)
+        ctx.found, ctx.losses, ctx.numbers = found, losses, numbers
         return traced
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         """Sweep back through the lens, and from its records to its numbers."""
         needs = ctx.needs_input_grad
-        cotangents = gradients[:3]
+        cotangents = (*gradients[:3], *gradients[5:])
         given = [cotangent for cotangent in cotangents if cotangent is not None]
         if not given:
             return (None,) * len(needs)
-        values, indices, position, direction, which, status = ctx.saved_tensors
-        found, numbers = ctx.found, ctx.numbers
-        wanted = (needs[3], needs[4], needs[2])
+        values, indices, position, direction, which, status, of_losses = ctx.saved_tensors
+        found, losses, numbers = ctx.found, ctx.losses, ctx.numbers
+        wanted = (needs[5], needs[6], needs[4])
         layout = found.layout
         rays = (position, direction, which)
         if is_eager(given) and not torch.is_grad_enabled():
             table = SurfaceTable(values, indices, layout.codes, layout.extras)
             known = prepared(layout, values.dtype)
             of_position, of_direction, sums = known.kernels.sweep(
-                table, *rays, status, cotangents, wanted, known.frames
+                *(table, *rays, status, cotangents, wanted, known.frames, losses, needs[3])
             )
-            flat = known.numbers.cotangents(sums) if True in needs[5:] else None
-            of_indices = sums[values.numel() :].reshape(indices.shape) if wanted[2] else None
+            flat = known.numbers.cotangents(sums) if True in needs[7:] else None
+            inner, outer = values.numel(), values.numel() + indices.numel()
+            of_indices = sums[inner:outer].reshape(indices.shape) if wanted[2] else None
+            of_losses = sums[outer:] if needs[3] else None
         else:
             # The gradient's own graph: its operator says that it has no derivative.
             scalars = len(found.scalars)
-            of_values, of_indices, of_position, of_direction = operators.trace_adjoint(
-                packed_values(layout, numbers[:scalars], numbers[scalars:]),
-                *(indices, *rays, layout.codes, layout.extras, status, *cotangents, list(wanted)),
-            )
+            packed = packed_values(layout, numbers[:scalars], numbers[scalars:])
+            traced = (*rays, layout.codes, layout.extras)
+            if losses is None:
+                of_values, of_indices, of_position, of_direction = operators.trace_adjoint(
+                    *(packed, indices, *traced, status, *cotangents, list(wanted))
+                )
+            else:
+                of_values, of_indices, of_losses, of_position, of_direction = (
+                    operators.trace_losses_adjoint(
+                        *(packed, indices, of_losses, *traced),
+                        *(losses.steps, losses.series, losses.absorbs),
+                        *(status, *cotangents, [*wanted, needs[3]]),
+                    )
+                )
             flat = cotangents_of_numbers(layout, of_values, layout.count)
         return (
-            *(None, None),
+            *(None, None, None),
+            of_losses if needs[3] else None,
             of_indices if wanted[2] else None,
             of_position if wanted[0] else None,
             of_direction if wanted[1] else None,
@@ -136,9 +164,11 @@ def _traced(
     position: Tensor,
     direction: Tensor,
     which: Tensor | None,
+    losses: LossTable | None,
 ) -> Traced:
     known = prepared(found.layout, table.values.dtype)
-    return known.kernels.trace(table, position, direction, which, known.frames)
+    traced: Traced = known.kernels.trace(table, position, direction, which, known.frames, losses)
+    return traced
 
 
 def _split(flat: Tensor, found: LaidOut) -> Sequence[Tensor]:

@@ -19,6 +19,7 @@ from dolens.errors import InputError
 from dolens.optics.autograd import is_transformed
 from dolens.optics.eager_trace import trace_by_operator, trace_eagerly, traces_eagerly
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.losses import Losses, loss_table
 from dolens.optics.packing import lay_out, unsupported
 from dolens.optics.rays import Components, Rays, TracedRays, finite_rays
 from dolens.optics.system import OpticalSystem
@@ -36,6 +37,7 @@ def trace_rays(
     first: int = 1,
     last: int | None = None,
     transmission: bool = False,
+    losses: Losses | None = None,
 ) -> TracedRays:
     """Trace rays through surfaces `first` to `last`, and to the sensor where no last is given.
 
@@ -47,15 +49,20 @@ def trace_rays(
         first: number of the first surface.
         last: number of the last, or None.
         transmission: find the share of light that arrives; the reference does this.
+        losses: of light, for `TracedRays.transmission`; the CPU's kernels alone take them.
 
     Raises:
-        InputError: the lens asks for kernels by name that cannot serve.
+        InputError: the lens asks for kernels by name that cannot serve, or the losses for others
+            than the CPU's.
     """
     if last is None and sense < 0.0:
         rays = from_sensor(system, rays)
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
-    reference = record or transmission or choose_backend(system, rays) == "reference"
+    backend = "reference" if record or transmission else choose_backend(system, rays)
+    reference = backend == "reference"
+    if losses is not None and backend != "cpu":
+        raise InputError(f"losses as series are taken by the CPU's kernels, not by '{backend}'")
     ray = before = None
     if reference or _is_finer(rays, system.dtype):
         ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
@@ -70,18 +77,25 @@ def trace_rays(
     position, direction, shape = _joined(system, rays, ray, before)
     found = lay_out(system, sense, first, end, to_sensor)
     which = _columns(rays.wavelength, shape, system.device)
-    eager = traces_eagerly(found, rays.wavelength, position, direction)
+    lost = None
+    if losses is not None:
+        wavelengths = rays.wavelength.numel() if isinstance(rays.wavelength, Tensor) else 1
+        lost = loss_table(losses, found, wavelengths, len(system.surfaces))
+    more = () if lost is None else (lost.numbers,)
+    eager = traces_eagerly(found, rays.wavelength, position, direction, *more)
     run = trace_eagerly if eager else trace_by_operator
-    position, direction, path, status, surface = run(
-        found, rays.wavelength, position, direction, which
+    position, direction, path, status, surface, *shares = run(
+        found, rays.wavelength, position, direction, which, lost
     )
     if len(shape) != 1:
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
         path, status, surface = (v.reshape(shape) for v in (path, status, surface))
+        shares = [share.reshape(shape) for share in shares]
     valid = status.logical_not()  # of OK, which is zero, in half the time of a comparison
     if before is not None:
         path = torch.where(valid, path + before, path + before.detach())
-    return TracedRays(position, direction, valid, status, surface, path)
+    share = shares[0] if shares else None
+    return TracedRays(position, direction, valid, status, surface, path, transmission=share)
 
 
 def from_sensor(system: OpticalSystem, rays: Rays) -> Rays:

@@ -60,6 +60,8 @@ class Sweeps(NamedTuple):
     forward: Any
     back: Any
     add_sums: Any
+    load_cotangents: Any
+    store: Any
 
 
 @cache
@@ -69,7 +71,7 @@ def sweeps(real: types.Type) -> Sweeps:
     """
     at = real_at(real)
     zero = real(0.0)
-    find_wavelength, load, set_indices, step = streams(real)
+    find_wavelength, load, set_indices, step, _ = streams(real)
 
     @njit(**OPTIONS)
     def load_lanes(job, lanes):  # noqa: ANN001, ANN202
@@ -172,17 +174,6 @@ def sweeps(real: types.Type) -> Sweeps:
                 for i in range(BLOCK):
                     sums[row + which[lanes[i]]] += types.float64(lane[i])
 
-    return Sweeps(load_lanes, gather, forward, back, add_sums)
-
-
-def adjoint_driver(real: types.Type) -> Callable[..., None]:
-    """Compile the sweep of chunks `first` to `last`: gradients of the rays, and sums for each
-    chunk.
-    """
-    at = real_at(real)
-    _, gather, forward, back, add_sums = sweeps(real)
-    zero = real(0.0)
-
     @njit(**OPTIONS)
     def load_cotangents(job, lanes, count, cot):  # noqa: ANN001, ANN202
         for i in range(OF_FRONT):
@@ -216,6 +207,22 @@ def adjoint_driver(real: types.Type) -> Callable[..., None]:
             out[place + 1] = cot[row + BLOCK + i]
             out[place + 2] = cot[row + 2 * BLOCK + i]
 
+    return Sweeps(load_lanes, gather, forward, back, add_sums, load_cotangents, store)
+
+
+def adjoint_driver(real: types.Type, losses: Any = None) -> Callable[..., None]:
+    """Compile the sweep of chunks `first` to `last`: gradients of the rays, and sums for each
+    chunk.
+
+    Args:
+        real: the precision.
+        losses: `PassedLight`, where the share of light that is left is asked for.
+    """
+    at = real_at(real)
+    _, gather, forward, back, add_sums, load_cotangents, store = sweeps(real)
+    lossy = losses is not None
+    keep, turn_round, prepare, finish = losses[3:] if lossy else (None, None, None, None)
+
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
         job = carray(job_, jobs.LENGTH)
         lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
@@ -229,14 +236,23 @@ def adjoint_driver(real: types.Type) -> Callable[..., None]:
                 count, ray = gather(job, ray, end, lanes)
                 if count == 0:
                     break
-                forward(job, lanes)
+                if lossy:
+                    keep(job, lanes)
+                else:
+                    forward(job, lanes)
                 load_cotangents(job, lanes, count, cot)
+                if lossy:
+                    turn_round(job, lanes, count)
                 total = types.float64(0.0)
                 for i in range(count):
                     total += types.float64(cot[Z + i])
                 sums[job[jobs.VALUES_LENGTH] - 1] += total
                 for k in range(job[jobs.STEPS] - 1, -1, -1):
+                    if lossy:
+                        prepare(job, k, lanes, sums)
                     back(job, k, lanes)
+                    if lossy:
+                        finish(job, k)
                     add_sums(job, k, lanes, sums)
                 if job[jobs.POSITION_GRADIENT] != 0:
                     store(job[jobs.POSITION_GRADIENT], lanes, count, cot, X)

@@ -16,15 +16,22 @@ from torch import Tensor
 
 from dolens.kernels.cpu import compiler, jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
-from dolens.kernels.cpu.compiler import int64_at, real64_at
+from dolens.kernels.cpu.compiler import Factory, int64_at, real64_at
 from dolens.kernels.cpu.forward import forward_driver, real_at
 from dolens.kernels.cpu.layout import BLOCK, UNBOUNDED
+from dolens.kernels.cpu.losses import lossy_adjoint_driver, lossy_forward_driver
 from dolens.kernels.cpu.program import Frame, Program, frame_of
 from dolens.kernels.cpu.threads import function_at
-from dolens.kernels.table import SurfaceTable
+from dolens.kernels.table import LossTable, SurfaceTable
 
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
+_COTANGENTS = (
+    jobs.POSITION_COTANGENT,
+    jobs.DIRECTION_COTANGENT,
+    jobs.PATH_COTANGENT,
+    jobs.TRANSMISSION_COTANGENT,
+)
 _RAY_GRADIENTS = (jobs.POSITION_GRADIENT, jobs.DIRECTION_GRADIENT)
 
 # Of programs of the same codes, extras and precision, without and with derivatives.
@@ -37,7 +44,8 @@ def trace(
     direction: Tensor,
     which: Tensor | None,
     frames: Frames | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    losses: LossTable | None = None,
+) -> tuple[Tensor, ...]:
     """Carry rays through every step.
 
     Args:
@@ -46,10 +54,11 @@ def trace(
         direction: (N, 3), unit vectors.
         which: (N,), int32, each ray's column of `table.indices`, or None for the first.
         frames: where those of the table are kept.
+        losses: of light, at the table's steps; None: none is asked for.
 
     Returns:
         position (N, 3), direction (N, 3), path length (N,), mm; status (N,), int8; and the surface
-        where the ray failed (N,), int16.
+        where the ray failed (N,), int16; with losses also the share of light that is left, (N,).
     """
     count = position.shape[0]
     out = (
@@ -58,14 +67,20 @@ def trace(
         position.new_empty(count),
         torch.empty(count, dtype=torch.int8),
         torch.empty(count, dtype=torch.int16),
+        *(() if losses is None else (position.new_empty(count),)),
     )
     if count == 0:
         return out
-    program = Program(table, derivatives=False, frame=_frame(table, False, frames))
+    program = Program(table, derivatives=False, frame=_frame(table, False, frames, losses))
     program.set_rays(position, direction, which)
-    # Position, direction, path, status and surface: neighbours in a job.
-    program.job[jobs.OUT_POSITION : jobs.OUT_SURFACE + 1] = [tensor.data_ptr() for tensor in out]
-    program.run(forward_driver, -(-count // BLOCK))
+    # Position, direction, path, status, surface and share: neighbours in a job.
+    end = jobs.OUT_POSITION + len(out)
+    program.job[jobs.OUT_POSITION : end] = [tensor.data_ptr() for tensor in out]
+    driver: Factory = forward_driver
+    if losses is not None:
+        program.lose(losses)
+        driver = lossy_forward_driver
+    program.run(driver, -(-count // BLOCK))
     return out
 
 
@@ -104,9 +119,11 @@ def sweep(
     direction: Tensor,
     which: Tensor | None,
     status: Tensor,
-    cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+    cotangents: Sequence[Tensor | None],
     wanted: tuple[bool, bool, bool],
     frames: Frames | None = None,
+    losses: LossTable | None = None,
+    of_losses: bool = False,
 ) -> tuple[Tensor | None, Tensor | None, Tensor]:
     """Return the cotangents of rays and table from those of position, direction and path length.
 
@@ -116,24 +133,29 @@ def sweep(
         direction: (N, 3).
         which: (N,), int32, or None.
         status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
-        cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
+        cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None;
+            with losses a fourth, of the share of light (N,).
         wanted: whether gradients of position, direction and indices are needed.
         frames: where those of the table are kept.
+        losses: as in `trace`.
+        of_losses: whether gradients of the losses' numbers are needed.
 
     Returns:
         Gradients of position and direction (None where not wanted), and in one tensor those of
-        `values` and then of `indices` (zeros where not wanted), float64.
+        `values`, then of `indices`, and then of the losses' numbers (zeros where not wanted, none
+        without), float64.
     """
     count = position.shape[0]
     gradients = [
         torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted[:2]
     ]
-    length = table.values.numel() + table.indices.numel()
+    length = inner = table.values.numel() + table.indices.numel()
+    length += losses.numbers.numel() if losses is not None else 0
     chunk = chunk_size(count)
     chunks = -(-count // chunk)
     sums = torch.zeros(length if chunks == 1 else (chunks, length), dtype=torch.float64)
     if count:
-        program = Program(table, derivatives=True, frame=_frame(table, True, frames))
+        program = Program(table, derivatives=True, frame=_frame(table, True, frames, losses))
         program.set_rays(position, direction, which)
         job = program.job
         job[jobs.OUT_STATUS] = status.data_ptr()
@@ -142,22 +164,26 @@ def sweep(
                 job[place] = gradient.data_ptr()
         job[jobs.SUMS], job[jobs.SUM_LENGTH], job[jobs.CHUNK] = sums.data_ptr(), length, chunk
         job[jobs.INDEX_SUMS] = int(wanted[2])
-        of_position, of_direction, of_path = cotangents
-        for place, tensor in (
-            (jobs.POSITION_COTANGENT, of_position),
-            (jobs.DIRECTION_COTANGENT, of_direction),
-            (jobs.PATH_COTANGENT, of_path),
-        ):
+        for place, tensor in zip(_COTANGENTS, cotangents, strict=False):
             if tensor is not None:
                 job[place] = tensor.data_ptr()
                 job[place + 1 : place + 1 + tensor.dim()] = tensor.stride()
-        program.run(adjoint_driver, chunks)
+        driver: Factory = adjoint_driver
+        if losses is not None:
+            program.lose(losses)
+            job[jobs.LOSS_SUMS] = inner if of_losses else 0
+            driver = lossy_adjoint_driver
+        program.run(driver, chunks)
     # PyTorch's sum, which adds pairwise.
     return gradients[0], gradients[1], sums if chunks == 1 else sums.sum(0)
 
 
-def _frame(table: SurfaceTable, derivatives: bool, frames: Frames | None) -> Frame:
+def _frame(
+    table: SurfaceTable, derivatives: bool, frames: Frames | None, losses: LossTable | None
+) -> Frame:
     """Return the frame of a table's programs, and keep it if there is where."""
+    if losses is not None:
+        return frame_of(table, derivatives, losses=losses)
     frame = None if frames is None else frames.get(derivatives)
     if frame is None:
         frame = frame_of(table, derivatives)

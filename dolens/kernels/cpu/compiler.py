@@ -354,6 +354,8 @@ class StepFunctions:
             and has cotangents for these alone.
         scratch: work rows of the shape's own, by its row of codes.
         numbers: how many a shape must have; None: any.
+        lossy_adjoint: the adjoint that takes cotangents of the cosines of incidence in; None: the
+            step loses no light.
     """
 
     forward: Factory
@@ -366,6 +368,7 @@ class StepFunctions:
     stencil: bool = False
     scratch: Callable[[Sequence[int]], int] = _none
     numbers: int | None = None
+    lossy_adjoint: Factory | None = None
 
     def of(self, row: Row, extras: Row) -> "StepFunctions":
         """Return the functions of a step with this row of codes: these, whatever it says."""

@@ -15,8 +15,10 @@ from dolens.kernels.cpu.layout import (
     INDEX,
     INVERSE_INDEX,
     LIMIT,
+    OF_ARRIVING,
     OF_BEHIND,
     OF_FRONT,
+    OF_LEAVING,
     OF_SECOND,
     OF_SHAPE,
     OF_SHIFT,
@@ -99,7 +101,7 @@ def _forward(real: types.Type, is_sphere: bool) -> Callable[..., None]:
     return kernel
 
 
-def _adjoint(real: types.Type, is_sphere: bool) -> Callable[..., None]:
+def _adjoint(real: types.Type, is_sphere: bool, lossy: bool = False) -> Callable[..., None]:
     *_, refract_adjoint = arithmetic(real)
     gradient, shape = scalar(conic_gradient, real), scalar(shape_cotangents, real)
     zero, one = real(0.0), real(1.0)
@@ -116,13 +118,23 @@ def _adjoint(real: types.Type, is_sphere: bool) -> Callable[..., None]:
             gx, gy, gz = gradient(c, k, x, y, z)
             inverse = one if is_sphere else one / math.sqrt(gx * gx + gy * gy + gz * gz)
             nx, ny, nz = gx * inverse, gy * inverse, gz * inverse
+            la, mb, nc = cot[L + i], cot[M + i], cot[N + i]
+            if lossy:
+                inner, outer = w[OF_ARRIVING + i], w[OF_LEAVING + i]
+                la, mb, nc = la + outer * nx, mb + outer * ny, nc + outer * nz
             dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
-                cot[L + i], cot[M + i], cot[N + i], l, m, n, nx, ny, nz,
+                la, mb, nc, l, m, n, nx, ny, nz,
                 dst[L + i], dst[M + i], dst[N + i], w[RATIO + i], w[INVERSE_INDEX + i],
             )  # fmt: skip
             if not refracts:
-                dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
+                dl, dm, dn = la, mb, nc
                 vx = vy = vz = of_before = of_behind = zero
+            if lossy:
+                # Of the cosines d·N and d'·N, where the normal moves with the point.
+                dl, dm, dn = dl + inner * nx, dm + inner * ny, dn + inner * nz
+                vx += inner * l + outer * dst[L + i]
+                vy += inner * m + outer * dst[M + i]
+                vz += inner * n + outer * dst[N + i]
             if not is_sphere:
                 # The cotangent of g: what lies across the normal, over |g|.
                 across = vx * nx + vy * ny + vz * nz
@@ -165,3 +177,13 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
 def sphere_adjoint(real: types.Type) -> Callable[..., None]:
     """Sweep cotangents back through a sphere, in place."""
     return _adjoint(real, True)
+
+
+def lossy_conic_adjoint(real: types.Type) -> Callable[..., None]:
+    """Sweep cotangents back through a conic that loses light, in place."""
+    return _adjoint(real, False, True)
+
+
+def lossy_sphere_adjoint(real: types.Type) -> Callable[..., None]:
+    """Sweep cotangents back through a sphere that loses light, in place."""
+    return _adjoint(real, True, True)

@@ -26,8 +26,10 @@ from dolens.kernels.cpu.layout import (
     INVERSE_INDEX,
     LIMIT,
     MARGIN,
+    OF_ARRIVING,
     OF_BEHIND,
     OF_FRONT,
+    OF_LEAVING,
     OF_SAG,
     OF_SHIFT,
     OF_SLOPE_X,
@@ -216,12 +218,16 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def explicit_adjoint(real: types.Type) -> Callable[..., None]:
+def explicit_adjoint(real: types.Type, lossy: bool = False) -> Callable[..., None]:
     """Sweep cotangents back through a surface, in place.
 
     With F = z - sag and g = ∇F, the ray meets the surface at P = Q + t·d, where
     dt = -(g·(dQ + t·dd) + F_θ·dθ)/(g·d).  With τ = (P̄·d + n̄·path)/(g·d), where n̄ is the index in
     front times the path's cotangent, Q̄ = P̄ - τ·g, d̄ gains t·Q̄, and θ̄ gains -τ·F_θ.
+
+    Args:
+        real: the precision.
+        lossy: add the cotangents of the cosines.
     """
     *_, refract_adjoint = arithmetic(real)
     zero, one = real(0.0), real(1.0)
@@ -240,13 +246,23 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
             sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
+            la, mb, nc = cot[L + i], cot[M + i], cot[N + i]
+            if lossy:
+                inner, outer = w[OF_ARRIVING + i], w[OF_LEAVING + i]
+                la, mb, nc = la + outer * nx, mb + outer * ny, nc + outer * nz
             dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
-                cot[L + i], cot[M + i], cot[N + i], l, m, n, nx, ny, nz,
+                la, mb, nc, l, m, n, nx, ny, nz,
                 dst[L + i], dst[M + i], dst[N + i], w[RATIO + i], w[INVERSE_INDEX + i],
             )  # fmt: skip
             if not refracts:
-                dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
+                dl, dm, dn = la, mb, nc
                 vx = vy = vz = of_before = of_behind = zero
+            if lossy:
+                # Of the cosines d·N and d'·N, where the normal moves with the point.
+                dl, dm, dn = dl + inner * nx, dm + inner * ny, dn + inner * nz
+                vx += inner * l + outer * dst[L + i]
+                vy += inner * m + outer * dst[M + i]
+                vz += inner * n + outer * dst[N + i]
             across = vx * nx + vy * ny + vz * nz
             of_sx, of_sy = -(vx - across * nx) * nz, -(vy - across * ny) * nz
             px = cot[X + i] + of_sx * w[SAG_XX + i] + of_sy * w[SAG_XY + i]
@@ -268,6 +284,11 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
+def lossy_explicit_adjoint(real: types.Type) -> Callable[..., None]:
+    """Sweep cotangents back through a surface that loses light, in place."""
+    return explicit_adjoint(real, True)
+
+
 def given_by_sag(
     sag: Factory, sag_hessian: Factory, parameters: Factory, **options: Any
 ) -> StepFunctions:
@@ -280,5 +301,7 @@ def given_by_sag(
         options: further fields of `StepFunctions`.
     """
     return StepFunctions(
-        explicit_forward, explicit_adjoint, sag, sag_hessian, parameters, **options
+        *(explicit_forward, explicit_adjoint, sag, sag_hessian, parameters),
+        lossy_adjoint=lossy_explicit_adjoint,
+        **options,
     )

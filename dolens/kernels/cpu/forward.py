@@ -59,6 +59,7 @@ class Streams(NamedTuple):
     load: Any
     set_indices: Any
     step: Any
+    store: Any
 
 
 def real_at(real: types.Type) -> Any:
@@ -71,6 +72,7 @@ def streams(real: types.Type) -> Streams:
     """Compile functions that load rays, fill in the indices, and run a step, for one real type."""
     at = real_at(real)
     zero, longest, farthest = real(0.0), real(LONGEST), real(FARTHEST)
+    largest = real(np.finfo(str(real)).max)
 
     @njit(**OPTIONS)
     def find_wavelength(job, lanes):  # noqa: ANN001, ANN202
@@ -196,55 +198,71 @@ def streams(real: types.Type) -> Streams:
         if codes[OUTLINE] >= RECTANGLE or codes[HOLE] != 0:
             call_block(job[jobs.CLIP], before, after, cotangents, record, work, place)
 
-    return Streams(find_wavelength, load, set_indices, step)
-
-
-def forward_driver(real: types.Type) -> Callable[..., None]:
-    """Compile the trace of blocks `first` to `last`, which writes the rays behind the last step."""
-    at = real_at(real)
-    _, load, _, step = streams(real)
-    zero = real(0.0)
-    largest = real(np.finfo(str(real)).max)
-
     @njit(**OPTIONS)
     def finite(value):  # noqa: ANN001, ANN202
         """Return the number, or zero: rays that are not valid may overflow."""
         return value if math.fabs(value) <= largest else zero
+
+    @njit(**OPTIONS)
+    def store(job, start, count, state_):  # noqa: ANN001, ANN202
+        """Write rays `start` to `start + count` as they are behind the last step."""
+        exit_z = carray(at(job[jobs.EXIT_Z]), 1)[0]
+        state = carray(state_, STATE)
+        position = carray(shifted(at(job[jobs.OUT_POSITION]), 3 * start), 3 * BLOCK)
+        direction = carray(shifted(at(job[jobs.OUT_DIRECTION]), 3 * start), 3 * BLOCK)
+        for i in range(count):
+            position[3 * i] = finite(state[X + i])
+            position[3 * i + 1] = finite(state[Y + i])
+            position[3 * i + 2] = finite(state[Z + i] + exit_z)
+        for i in range(count):
+            direction[3 * i] = finite(state[L + i])
+            direction[3 * i + 1] = finite(state[M + i])
+            direction[3 * i + 2] = finite(state[N + i])
+        path = carray(shifted(at(job[jobs.OUT_PATH]), start), BLOCK)
+        status = carray(shifted(int8_at(job[jobs.OUT_STATUS]), start), BLOCK)
+        surface = carray(shifted(int16_at(job[jobs.OUT_SURFACE]), start), BLOCK)
+        for i in range(count):
+            path[i] = finite(state[PATH + i])
+        for i in range(count):
+            ended, vignetted = state[ENDED + i], state[VIGNETTED + i]
+            code = types.int64(ended if ended > zero else vignetted)
+            surface[i] = code >> STATUS_BITS
+            status[i] = code & STATUS_MASK
+
+    return Streams(find_wavelength, load, set_indices, step, store)
+
+
+def forward_driver(real: types.Type, losses: Any = None) -> Callable[..., None]:
+    """Compile the trace of blocks `first` to `last`, which writes the rays behind the last step.
+
+    Args:
+        real: the precision.
+        losses: `PassedLight`, where the share of light that is left is asked for.
+    """
+    at = real_at(real)
+    _, load, _, step, store = streams(real)
+    lossy = losses is not None
+    begin, go_on, store_share = losses[:3] if lossy else (None, None, None)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
         job = carray(job_, jobs.LENGTH)
         rays, steps = job[jobs.RAYS], job[jobs.STEPS]
         lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
         work = at(job[jobs.WORK])
-        exit_z = carray(at(job[jobs.EXIT_Z]), 1)[0]
         for block in range(first, last):
             start = BLOCK * block
             count = min(BLOCK, rays - start)
             now, then = at(job[jobs.STACK]), shifted(at(job[jobs.STACK]), STATE)
             load(job, start, count, now, lanes)
+            if lossy:
+                begin(job)
             for k in range(steps):
                 step(job, k, lanes, now, then, then, work)
+                if lossy:
+                    go_on(job, k, lanes, now, then)
                 now, then = then, now
-            state = carray(now, STATE)
-            position = carray(shifted(at(job[jobs.OUT_POSITION]), 3 * start), 3 * BLOCK)
-            direction = carray(shifted(at(job[jobs.OUT_DIRECTION]), 3 * start), 3 * BLOCK)
-            for i in range(count):
-                position[3 * i] = finite(state[X + i])
-                position[3 * i + 1] = finite(state[Y + i])
-                position[3 * i + 2] = finite(state[Z + i] + exit_z)
-            for i in range(count):
-                direction[3 * i] = finite(state[L + i])
-                direction[3 * i + 1] = finite(state[M + i])
-                direction[3 * i + 2] = finite(state[N + i])
-            path = carray(shifted(at(job[jobs.OUT_PATH]), start), BLOCK)
-            status = carray(shifted(int8_at(job[jobs.OUT_STATUS]), start), BLOCK)
-            surface = carray(shifted(int16_at(job[jobs.OUT_SURFACE]), start), BLOCK)
-            for i in range(count):
-                path[i] = finite(state[PATH + i])
-            for i in range(count):
-                ended, vignetted = state[ENDED + i], state[VIGNETTED + i]
-                code = types.int64(ended if ended > zero else vignetted)
-                surface[i] = code >> STATUS_BITS
-                status[i] = code & STATUS_MASK
+            store(job, start, count, now)
+            if lossy:
+                store_share(job, start, count)
 
     return kernel

@@ -68,7 +68,7 @@ def columns(real: types.Type) -> Columns:
     type.
     """
     at = real_at(real)
-    _, load, set_indices, step = streams(real)
+    _, load, set_indices, step, _ = streams(real)
     load_lanes, *_ = sweeps(real)
     zero, one = real(0.0), real(1.0)
 

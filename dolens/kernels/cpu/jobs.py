@@ -7,7 +7,7 @@ POSITION, POSITION_ROW, POSITION_COLUMN = range(3)
 DIRECTION, DIRECTION_ROW, DIRECTION_COLUMN = range(3, 6)
 WHICH, RAYS, STEPS, CODES, VALUES, INDICES, WAVELENGTHS, EXIT_Z, CLIP = range(6, 15)
 STACK, COTANGENTS, WORK = range(15, 18)
-OUT_POSITION, OUT_DIRECTION, OUT_PATH, OUT_STATUS, OUT_SURFACE = range(18, 23)
+OUT_POSITION, OUT_DIRECTION, OUT_PATH, OUT_STATUS, OUT_SURFACE, OUT_TRANSMISSION = range(18, 24)
 POSITION_COTANGENT, POSITION_COTANGENT_ROW, POSITION_COTANGENT_COLUMN = range(24, 27)
 DIRECTION_COTANGENT, DIRECTION_COTANGENT_ROW, DIRECTION_COTANGENT_COLUMN = range(27, 30)
 PATH_COTANGENT, PATH_COTANGENT_ROW = range(30, 32)
@@ -31,4 +31,8 @@ INDEX_ENTRIES, INDEX_ROWS, INDEX_COLUMNS, INDEX_WEIGHTS = range(66, 70)
 # Of many lenses: the driver of one, the pieces of one, and how far the address at a place moves on
 # from one lens to the next: pairs of place and bytes, and how many pairs.
 INNER_DRIVER, INNER_PIECES, STRIDES, STRIDE_PAIRS = range(70, 74)
-LENGTH = 80  # of a job: whole lines of the cache
+# Of losses: their numbers; where among these ratios and coefficients begin; how many series there
+# are, and their terms; whether media absorb; where the sums of these numbers begin, or zero.
+LOSSES, RATIOS, COEFFICIENTS, SERIES, TERMS, ABSORBS, LOSS_SUMS = range(74, 81)
+TRANSMISSION_COTANGENT, TRANSMISSION_COTANGENT_ROW = range(81, 83)
+LENGTH = 88  # of a job: whole lines of the cache

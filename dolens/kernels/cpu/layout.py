@@ -40,7 +40,9 @@ OF_SAG, OF_SLOPE_X, OF_SLOPE_Y, DISTANCE = _rows(11, 4)
 (PER_RADIAN,) = _rows(18, 1)
 PHASE, PHASE_X, PHASE_Y, PHASE_XX, PHASE_XY, PHASE_YY = _rows(19, 6)
 OF_PHASE, OF_PHASE_X, OF_PHASE_Y = _rows(25, 3)
-WORK_ROWS = 28  # those above
+# Cotangents of the cosines d·N in front of and behind a surface that loses light.
+OF_ARRIVING, OF_LEAVING = _rows(28, 2)
+WORK_ROWS = 30  # those above
 WORK_SIZE = WORK_ROWS * BLOCK
 # As many more as a shape asks for: a grid's cells, a spline's stencil.
 (FURTHER,) = _rows(WORK_ROWS, 1)
@@ -61,6 +63,15 @@ OF_SHAPE, OF_SECOND = _rows(COTANGENT_HEADER + Slot.HEADER, 2)
 STENCIL_NUMBERS = 17
 (STENCIL_PLACE,) = _rows(COTANGENT_HEADER + Slot.HEADER + 16, 1)
 
+# A driver's own rows, where light is lost: the optical depth of the media; cotangents of the share
+# that surfaces pass, of the depth and of the path; the argument of a series, and its sums.
+DEPTH, OF_SHARE, OF_DEPTH, OF_PATH, ARGUMENT = _rows(0, 5)
+SUM, BEFORE_SUM, WEIGHT = _rows(5, 3)
+# Then of each series: the cosine at its surface, the share of the light that arrives there, the
+# share of this that goes on, and its derivative.
+LOSS_ROWS = 8
+COSINES, SHARES, FACTORS, SLOPES = _rows(LOSS_ROWS, 4)
+ROWS_OF_A_SERIES = 4
 
 SHIFT, LIMIT, SCALE = Slot.SHIFT, Slot.LIMIT, Slot.SCALE
 EDGE, HALF_X, HALF_Y = Slot.EDGE, Slot.HALF_X, Slot.HALF_Y
@@ -90,9 +101,12 @@ STARTS_ON_CONIC, STENCIL = Code.ROW + 5, Code.ROW + 6
 PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 7, Code.ROW + 10)
 # Those of the even asphere that other shapes add to.
 ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 10, Code.ROW + 13)
-CODE_ROW = Code.ROW + 13
+# Which series of a table of losses a step has, plus one, or zero; and a `Cosine`.
+LOSS, COSINE = range(Code.ROW + 13, Code.ROW + 15)
+CODE_ROW = Code.ROW + 15
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
+DEFLECT, SPHERE, CONIC = int(Kind.DEFLECT), int(Kind.SPHERE), int(Kind.CONIC)
 CIRCLE, RECTANGLE, ELLIPSE = int(Outline.CIRCLE), int(Outline.RECTANGLE), int(Outline.ELLIPSE)
 
 STATUS_BITS, STATUS_MASK = Failure.BITS, Failure.MASK

@@ -12,8 +12,10 @@ from dolens.kernels.cpu.layout import (
     INDEX,
     INVERSE_INDEX,
     LIMIT,
+    OF_ARRIVING,
     OF_BEHIND,
     OF_FRONT,
+    OF_LEAVING,
     OF_SHIFT,
     PATH,
     RATIO,
@@ -67,10 +69,14 @@ def plane_forward(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def plane_adjoint(real: types.Type) -> Callable[..., None]:
+def plane_adjoint(real: types.Type, lossy: bool = False) -> Callable[..., None]:
     """Sweep cotangents back through a plane, in place.
 
     l' = μl, m' = μm, n'² = 1 - μ²(1 - n²); on the plane z = 0 and the distance is -z/n.
+
+    Args:
+        real: the precision.
+        lossy: add those of the cosines, which are n and n'.
     """
     zero, one = real(0.0), real(1.0)
 
@@ -82,6 +88,8 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
         for i in range(BLOCK):
             l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             a, b, c = cot[L + i], cot[M + i], cot[N + i]
+            if lossy:
+                c += w[OF_LEAVING + i]
             of_before = of_behind = zero
             if refracts:
                 ratio, behind = w[RATIO + i], dst[N + i]
@@ -89,6 +97,8 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
                 of_before = of_ratio * ratio * w[INVERSE_INDEX + i]
                 of_behind = -of_before * ratio
                 a, b, c = ratio * a, ratio * b, ratio * ratio * n / behind * c
+            if lossy:
+                c += w[OF_ARRIVING + i]
             path, t = cot[PATH + i], dst[TRAVELLED + i]
             x, y = cot[X + i], cot[Y + i]
             z = -(x * l + y * m + w[INDEX + i] * path) / n
@@ -99,3 +109,8 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
             cot[OF_SHIFT + i] = z
 
     return kernel
+
+
+def lossy_plane_adjoint(real: types.Type) -> Callable[..., None]:
+    """Sweep cotangents back through a plane that loses light, in place."""
+    return plane_adjoint(real, True)

@@ -25,6 +25,8 @@ from dolens.kernels.cpu.compiler import LawBlocks, Row, StepFunctions
 from dolens.kernels.cpu.conic import (
     conic_adjoint,
     conic_forward,
+    lossy_conic_adjoint,
+    lossy_sphere_adjoint,
     sphere_adjoint,
     sphere_forward,
 )
@@ -36,12 +38,16 @@ from dolens.kernels.cpu.layout import (
     ASPHERE_SAG,
     BLOCK,
     CODE_ROW,
+    COSINE,
     COTANGENT_HEADER,
     FORWARD,
+    LOSS,
+    LOSS_ROWS,
     PARAMETERS,
     PHASE_AND_SLOPES,
     PHASE_HESSIAN,
     PHASE_PARAMETERS,
+    ROWS_OF_A_SERIES,
     SAG_AND_SLOPES,
     SAG_HESSIAN,
     STARTS_ON_CONIC,
@@ -50,19 +56,28 @@ from dolens.kernels.cpu.layout import (
     STENCIL_NUMBERS,
     WORK_ROWS,
 )
-from dolens.kernels.cpu.plane import plane_adjoint, plane_forward
+from dolens.kernels.cpu.plane import lossy_plane_adjoint, plane_adjoint, plane_forward
 from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
 from dolens.kernels.shapes import shape_named
 from dolens.kernels.surface_kernel import kernels_of, law_kernels_of
-from dolens.kernels.table import OUTPUT_ROWS, Code, Kind, Outline, Slot, SurfaceTable, VariableMap
+from dolens.kernels.table import (
+    OUTPUT_ROWS,
+    Code,
+    Kind,
+    LossTable,
+    Outline,
+    Slot,
+    SurfaceTable,
+    VariableMap,
+)
 
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 
 # Steps that `Kind` names; the sensor's adjoint is a plane's between equal media.
 _STEPS = {
-    Kind.PLANE: StepFunctions(plane_forward, plane_adjoint),
-    Kind.SPHERE: StepFunctions(sphere_forward, sphere_adjoint),
-    Kind.CONIC: StepFunctions(conic_forward, conic_adjoint),
+    Kind.PLANE: StepFunctions(plane_forward, plane_adjoint, lossy_adjoint=lossy_plane_adjoint),
+    Kind.SPHERE: StepFunctions(sphere_forward, sphere_adjoint, lossy_adjoint=lossy_sphere_adjoint),
+    Kind.CONIC: StepFunctions(conic_forward, conic_adjoint, lossy_adjoint=lossy_conic_adjoint),
     Kind.CHANGE_AXES: StepFunctions(change_axes_forward, change_axes_adjoint),
     Kind.LENS_AXES: StepFunctions(lens_axes_forward, lens_axes_adjoint),
     Kind.SENSOR: StepFunctions(sensor_forward, plane_adjoint),
@@ -99,12 +114,17 @@ class Steps(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool) -> Steps:
-    """Compile what the steps of a table need: a pure function of its codes and its extras."""
+def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool, losses: bytes) -> Steps:
+    """Compile what the steps of a table need: a pure function of its codes and its extras, and of
+    the steps of its losses.
+    """
     extras = np.frombuffer(integers, dtype=np.int64)
     table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
     rows = np.zeros((max(len(table), 1), CODE_ROW), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
+    if losses:
+        series = np.frombuffer(losses, dtype=np.int64).reshape(-1, 2)
+        rows[: len(table), LOSS], rows[: len(table), COSINE] = series[:, 0] + 1, series[:, 1]
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
         if row[Code.KIND] == Kind.DEFLECT:
@@ -124,7 +144,12 @@ def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool) -> Steps
             _compile_sag(row, extras, functions, real, derivatives)
             row[STARTS_ON_CONIC], row[STENCIL] = functions.starts_on_conic, functions.stencil
         if derivatives:
-            row[ADJOINT] = compiler.compile_block(functions.adjoint, real)
+            adjoint = functions.lossy_adjoint if row[LOSS] else functions.adjoint
+            if adjoint is None:
+                raise InputError(
+                    f"the CPU kernels '{functions.forward.__name__}' have no adjoint of losses"
+                )
+            row[ADJOINT] = compiler.compile_block(adjoint, real)
         length = Slot.HEADER + STENCIL_NUMBERS if functions.stencil else int(row[Code.LENGTH])
         longest = max(longest, length)
         scratch = max(scratch, functions.scratch(row))
@@ -150,7 +175,9 @@ class Frame(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _frame(key: tuple[bytes, bytes, str, bool], outputs: int, columns: int, size: int) -> Frame:
+def _frame(
+    key: tuple[bytes, bytes, str, bool, bytes], outputs: int, columns: int, size: int
+) -> Frame:
     """Return the frame of programs.
 
     Args:
@@ -159,7 +186,7 @@ def _frame(key: tuple[bytes, bytes, str, bool], outputs: int, columns: int, size
         columns: further rows of a block that a driver asks for.
         size: bytes of a number.
     """
-    steps, derivatives = _steps(*key), key[-1]
+    steps, derivatives = _steps(*key), key[3]
     job = np.zeros(jobs.LENGTH, dtype=np.int64)
     job[jobs.STEPS], job[jobs.CODES] = len(key[0]) // (8 * Code.ROW), steps.codes.ctypes.data
     job[jobs.CLIP] = steps.clip
@@ -181,10 +208,19 @@ def _frame(key: tuple[bytes, bytes, str, bool], outputs: int, columns: int, size
     return Frame(steps.codes, job, end, tuple(parts))
 
 
-def frame_of(table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0) -> Frame:
+def frame_of(
+    table: SurfaceTable,
+    derivatives: bool,
+    outputs: int = 1,
+    columns: int = 0,
+    losses: LossTable | None = None,
+) -> Frame:
     """Return the frame of a table's programs; the arguments are `Program`'s."""
     integers = (table.codes.numpy().tobytes(), table.extras.numpy().tobytes())
-    key = (*integers, REAL[table.values.dtype], derivatives)
+    of_losses = b"" if losses is None else losses.steps.numpy().tobytes()
+    if losses is not None:
+        columns += LOSS_ROWS + ROWS_OF_A_SERIES * (losses.series + 1)
+    key = (*integers, REAL[table.values.dtype], derivatives, of_losses)
     return _frame(key, outputs, columns, table.values.itemsize)
 
 
@@ -266,6 +302,20 @@ class Program:
             *(direction.data_ptr(), *direction.stride()),
             0 if which is None else which.data_ptr(),
             position.shape[0],
+        )
+
+    def lose(self, losses: LossTable) -> None:
+        """Point to the numbers of losses."""
+        wavelengths = self.table.indices.shape[1]
+        ratios = self.table.indices.numel()
+        coefficients = ratios + losses.series * (wavelengths + 1)
+        terms = losses.numbers.numel() - coefficients
+        terms //= max(3 * losses.series * wavelengths, 1)
+        self._losses = losses  # held
+        # Neighbours in a job.
+        self.job[jobs.LOSSES : jobs.ABSORBS + 1] = (
+            *(losses.numbers.data_ptr(), ratios, coefficients),
+            *(losses.series, terms, int(losses.absorbs)),
         )
 
     def point(self, **tensors: Tensor | None) -> None:

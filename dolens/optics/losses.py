@@ -1,0 +1,176 @@
+"""Light is lost at surfaces and in media; the kernels take both as numbers.
+
+A surface passes, or a mirror reflects, a share of unpolarised light's power that is given as a
+Chebyshev series in the cosine of incidence, Σ c_k·T_k(x), from x = -1 at the lowest cosine to 1 at
+normal incidence.  The coefficients are a linear map of the shares at `nodes`, so that autograd goes
+on from them to whatever a coating is made of.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from dolens.cached_tensors import cached_tensors
+from dolens.errors import InputError
+from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
+from dolens.optics.packing import LaidOut
+from dolens.optics.records import Records, tensor
+
+# Steps that are no surfaces of the lens; a law deflects what its surface has passed.
+_BETWEEN = (Kind.CHANGE_AXES, Kind.LENS_AXES, Kind.SENSOR, Kind.DEFLECT)
+_GROUP = 4  # coefficients that a kernel takes at once
+
+
+@dataclass(frozen=True, eq=False)
+class Losses:
+    """What a lens loses of light of W wavelengths; a surface that is not named passes all of it.
+
+    A series converges fast in the cosine of the medium of the lower index, since in the other it
+    has the root of the critical angle: for light from glass to air that is `Cosine.LEAVING`.
+
+    Attributes:
+        numbers: of S surfaces, from 1.
+        coefficients: (S, W, K), of each surface's share as a series.
+        cosines: S of them: which cosine the series is a function of; () where all arrive.
+        lowest: S of them, below 1: the series are for cosines from here to 1, and steeper light
+            has the share of this; () where all are 0.
+        ratios: (S, W), index in front over that of the medium beyond a mirror, for
+            `Cosine.BEYOND`; None where none is.
+        absorption: (media, W), 1/mm: α of exp(-α·t), before surface 1 and after each surface; None:
+            all media are clear.
+    """
+
+    numbers: tuple[int, ...]
+    coefficients: Tensor
+    cosines: tuple[Cosine, ...] = ()
+    lowest: tuple[float, ...] = ()
+    ratios: Tensor | None = None
+    absorption: Tensor | None = None
+
+
+def nodes(count: int, lowest: float = 0.0) -> Tensor:
+    """Return the cosines (count,), ascending, at which shares determine a series."""
+    angle = _angles(count)
+    return 1.0 - (1.0 - lowest) * torch.sin(0.5 * angle) ** 2
+
+
+def _angles(count: int) -> Tensor:
+    return math.pi * (count - 0.5 - torch.arange(count, dtype=torch.float64)) / count
+
+
+@cached_tensors(maxsize=16)
+def _transform(count: int) -> Tensor:
+    """Return the map (nodes, coefficients) from shares to their series."""
+    map_ = torch.cos(_angles(count)[:, None] * torch.arange(count)) * (2.0 / count)
+    map_[:, 0] *= 0.5
+    return map_
+
+
+@cached_tensors(maxsize=16)
+def _powers(count: int) -> Tensor:
+    """Return the map of a series's coefficients to those of powers of x."""
+    map_ = torch.eye(count, dtype=torch.float64)
+    for k in range(2, count):
+        map_[k] = 2.0 * map_[k - 1].roll(1) - map_[k - 2]
+    return map_
+
+
+@cached_tensors(maxsize=16)
+def _derivative(count: int) -> Tensor:
+    """Return the map of a series's coefficients to those of its derivative: T_k' is 2k times the
+    sum of T_(k-1), T_(k-3) and so on, with half of T_0.
+    """
+    k, j = torch.arange(count, dtype=torch.float64)[:, None], torch.arange(count)
+    map_ = torch.where((j < k) & ((k - j) % 2 == 1), 2.0 * k, 0.0)
+    map_[:, 0] *= 0.5
+    return map_
+
+
+def series(shares: Tensor) -> Tensor:
+    """Return the coefficients (..., K) of the series with these shares (..., K) at `nodes`."""
+    return shares.double() @ _transform(shares.shape[-1]).to(shares.device)
+
+
+def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) -> LossTable:
+    """Return the losses at a table's steps.
+
+    Args:
+        losses: of the whole lens.
+        found: the part of it that is traced.
+        wavelengths: columns of the table's indices.
+        surfaces: of the lens.
+
+    Raises:
+        InputError: tensors of other shapes than the lens and the wavelengths ask for.
+    """
+    layout = found.layout
+    absorption, ratios = losses.absorption, losses.ratios
+    _check(losses, wavelengths, surfaces)
+    steps, order = _steps(layout, losses.numbers, losses.cosines)
+    coefficients = losses.coefficients.double()
+    if coefficients.shape[-1] % _GROUP:
+        coefficients = pad(coefficients, (0, -coefficients.shape[-1] % _GROUP))
+    if ratios is None:
+        ratios = coefficients.new_ones((len(losses.numbers), wavelengths))
+    media = len(layout.media) + int(layout.waves)
+    if absorption is None:
+        of_media = coefficients.new_zeros((media, wavelengths))
+    else:
+        of_media = pad(absorption.double()[_media(layout)], (0, 0, 0, media - len(layout.media)))
+    coefficients = coefficients[order]
+    lowest = torch.tensor(losses.lowest or (0.0,) * len(losses.numbers), dtype=torch.float64)
+    scales = 2.0 / (1.0 - lowest[order])
+    terms, summed = coefficients.shape[-1], coefficients.detach()
+    slopes = scales[:, None, None] * (summed @ _derivative(terms))
+    if terms <= POWERS:
+        summed, slopes = summed @ _powers(terms), slopes @ _powers(terms)
+    parts = (of_media, ratios.double()[order], scales, coefficients, summed, slopes)
+    numbers = torch.cat([part.reshape(-1) for part in parts])
+    return LossTable(numbers, steps, len(order), absorption is not None)
+
+
+@cached_tensors(maxsize=256)
+def _steps(
+    layout: Records, numbers: tuple[int, ...], cosines: tuple[Cosine, ...]
+) -> tuple[Tensor, Tensor]:
+    """Return `LossTable.steps`, and which of the surfaces of these numbers its series are of."""
+    found: list[tuple[int, int]] = []
+    order: list[int] = []
+    for row in layout.codes:
+        number = int(layout.constants[int(row[Code.OFFSET]) + Slot.TAG]) >> Failure.BITS
+        series, cosine = -1, Cosine.ARRIVING
+        if int(row[Code.KIND]) not in _BETWEEN and number in numbers:
+            place, series = numbers.index(number), len(order)
+            cosine = cosines[place] if cosines else cosine
+            order.append(place)
+        found.append((series, int(cosine)))
+    return tensor(found, np.int64).reshape(-1, 2), tensor(order, np.int64)
+
+
+@cached_tensors(maxsize=256)
+def _media(layout: Records) -> Tensor:
+    return tensor(layout.media, np.int64)
+
+
+def _check(losses: Losses, wavelengths: int, surfaces: int) -> None:
+    """Raise `InputError` where losses do not fit the lens and its light."""
+    numbers, count = losses.numbers, len(losses.numbers)
+    if any(number not in range(1, surfaces + 1) for number in numbers) or len(set(numbers)) < count:
+        raise InputError(f"losses: surfaces {numbers}, each once, of a lens of {surfaces}")
+    shapes = {
+        "coefficients": (losses.coefficients, (count, wavelengths)),
+        "ratios": (losses.ratios, (count, wavelengths)),
+        "absorption": (losses.absorption, (surfaces + 1, wavelengths)),
+    }
+    for name, (given, shape) in shapes.items():
+        if given is not None and tuple(given.shape[:2]) != shape:
+            raise InputError(f"losses: {name} {tuple(given.shape)} must begin with {shape}")
+    for name, of_surfaces in (("cosines", losses.cosines), ("lowest", losses.lowest)):
+        if of_surfaces and len(of_surfaces) != count:
+            raise InputError(f"losses: {len(of_surfaces)} {name} for {count} surfaces")
+    if any(not 0.0 <= lowest < 1.0 for lowest in losses.lowest):
+        raise InputError(f"losses: lowest cosines from 0 to below 1, not {losses.lowest}")
