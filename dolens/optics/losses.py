@@ -7,6 +7,7 @@ on from them to whatever a coating is made of.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from dolens.errors import InputError
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
 from dolens.optics.packing import LaidOut
 from dolens.optics.records import Records, tensor
+from dolens.optics.system import OpticalSystem
 
 # Steps that are no surfaces of the lens; a law deflects what its surface has passed.
 _BETWEEN = (Kind.CHANGE_AXES, Kind.LENS_AXES, Kind.SENSOR, Kind.DEFLECT)
@@ -93,6 +95,58 @@ def _derivative(count: int) -> Tensor:
 def series(shares: Tensor) -> Tensor:
     """Return the coefficients (..., K) of the series with these shares (..., K) at `nodes`."""
     return shares.double() @ _transform(shares.shape[-1]).to(shares.device)
+
+
+def losses_of(
+    system: OpticalSystem,
+    wavelengths: Tensor,
+    terms: int = 12,
+    lowest: Mapping[int, float] | None = None,
+) -> Losses:
+    """Return the losses of a lens's coatings and glasses, for light towards the sensor.
+
+    Args:
+        system: the lens.
+        wavelengths: (W,), nm.
+        terms: coefficients of each series: 12 err by some 1e-6 for bare glass and thin coatings at
+            all angles.
+        lowest: number of a surface → the lowest cosine of its rays; of others 0.
+    """
+    waves = wavelengths.double().reshape(-1, 1)
+    indices = [torch.as_tensor(n).double().expand(waves.shape) for n in system.indices(waves)]
+    numbers, coefficients, cosines, ratios = [], [], [], []
+    for number, surface in enumerate(system.surfaces, 1):
+        coating = surface.coating
+        if coating is None:
+            continue
+        numbers.append(number)
+        front, behind = indices[number - 1], indices[number]
+        mirror = number in system.mirrors
+        beyond = coating.behind(behind, waves) if mirror else behind
+        ratio = front / beyond
+        thinner = not ratio.is_complex() and bool((ratio > 1.0).all())
+        thinner = thinner and surface.deflection is None
+        u = nodes(terms, (lowest or {}).get(number, 0.0)).expand(len(waves), terms)
+        cosine = Cosine.ARRIVING
+        if thinner:
+            cosine = Cosine.BEYOND if mirror else Cosine.LEAVING
+            u = (1.0 - (1.0 - u.square()) / ratio.square()).sqrt()
+        cosines.append(cosine)
+        ratios.append(ratio if cosine == Cosine.BEYOND else torch.ones_like(waves))
+        r_s, r_p, t_s, t_p = coating.shares(front, behind, u, waves)
+        coefficients.append(series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p)))
+    absorptions = [torch.as_tensor(a).double() for a in system.absorptions(waves[:, 0])]
+    clear = not any(bool((a != 0.0).any()) for a in absorptions)
+    absorbed = torch.stack([a.expand(len(waves)) for a in absorptions])
+    empty = waves.new_zeros((0, len(waves), terms))
+    return Losses(
+        tuple(numbers),
+        torch.stack(coefficients) if numbers else empty,
+        tuple(cosines),
+        tuple((lowest or {}).get(number, 0.0) for number in numbers),
+        torch.stack(ratios)[..., 0] if Cosine.BEYOND in cosines else None,
+        None if clear else absorbed,
+    )
 
 
 def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) -> LossTable:

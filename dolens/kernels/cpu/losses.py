@@ -69,7 +69,7 @@ from dolens.kernels.cpu.layout import (
 from dolens.kernels.cpu.translation import scalar
 from dolens.kernels.table import POWERS, TINY, Cosine
 
-# A call between functions takes as long as a loop over a block.
+# A call between functions takes as long as a loop over a block; what is rare is not inlined.
 _INLINED = {**OPTIONS, "forceinline": True}
 _LEAVING, _BEYOND = int(Cosine.LEAVING), int(Cosine.BEYOND)
 _NEXT = ROWS_OF_A_SERIES * BLOCK  # from the rows of a series to those of the next
@@ -207,7 +207,7 @@ def passed_light(real: types.Type) -> PassedLight:
                 u[i] = held(sense * d[N + i])
                 x[i] = argument(u[i], scale, lowest)
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def set_by_wavelength(job, numbers, lanes, row_):  # noqa: ANN001, ANN202
         """Fill a row with each ray's number of a table's row."""
         row = carray(row_, BLOCK)
@@ -220,12 +220,12 @@ def passed_light(real: types.Type) -> PassedLight:
             for i in range(BLOCK):
                 row[i] = real(numbers[which[lanes[i]]])
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def set_ratios(job, codes, lanes, row_):  # noqa: ANN001, ANN202
         place = job[jobs.RATIOS] + (codes[LOSS] - 1) * job[jobs.WAVELENGTHS]
         set_by_wavelength(job, numbers_at(job, place), lanes, row_)
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def go_beyond(job, codes, lanes, cosine_, x_):  # noqa: ANN001, ANN202
         """Fill the row of arguments from cosines beyond a mirror."""
         set_ratios(job, codes, lanes, x_)
@@ -258,7 +258,7 @@ def passed_light(real: types.Type) -> PassedLight:
             for i in range(BLOCK):
                 b[i] = (((b[i] * x[i] + c3) * x[i] + c2) * x[i] + c1) * x[i] + c0
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def sum_chebyshev(job, first, x_, sum_, before_):  # noqa: ANN001, ANN202
         """Fill a row with a series by Clenshaw's sums b_k = c_k + 2x·b_(k+1) - b_(k+2)."""
         x, b, e = carray(x_, BLOCK), carray(sum_, BLOCK), carray(before_, BLOCK)
@@ -276,7 +276,7 @@ def passed_light(real: types.Type) -> PassedLight:
         for i in range(BLOCK):
             b[i] -= x[i] * e[i]
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def sum_mixed(job, first, lanes, x_, sum_, before_):  # noqa: ANN001, ANN202
         """Fill a row with either, of rays of several wavelengths."""
         x, b, e = carray(x_, BLOCK), carray(sum_, BLOCK), carray(before_, BLOCK)
@@ -319,7 +319,7 @@ def passed_light(real: types.Type) -> PassedLight:
         place = codes[BEFORE] * job[jobs.WAVELENGTHS] + common
         return common >= 0 and numbers_at(job, place)[0] == types.float64(0.0)
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def begin(job):  # noqa: ANN001, ANN202
         rows = carray(at(job[jobs.DRIVER_ROWS]), UNBOUNDED)
         for i in range(BLOCK):
@@ -421,7 +421,7 @@ def passed_light(real: types.Type) -> PassedLight:
             for i in range(BLOCK):
                 sums[place + which[lanes[i]]] += types.float64(row[i])
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def add_coefficients(job, codes, lanes, rows, sums):  # noqa: ANN001, ANN202
         """Add the cotangents h·T_k(x) of the coefficients; h is in the row SUM, h·x in the next."""
         x = carray(shifted(rows, ARGUMENT), BLOCK)
@@ -452,7 +452,7 @@ def passed_light(real: types.Type) -> PassedLight:
                     sums[place + j + terms * which[lanes[i]]] += types.float64(b[i])
                     b[i], e[i] = e[i], two * x[i] * e[i] - b[i]
 
-    @njit(**_INLINED)
+    @njit(**OPTIONS)
     def come_back(job, codes, lanes, cosine_, rows, sums):  # noqa: ANN001, ANN202
         """Turn the cotangents of a cosine beyond a mirror into those of the arriving one, and add
         those of the ratios.
