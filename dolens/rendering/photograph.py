@@ -9,7 +9,9 @@ from torch import Tensor
 
 from dolens.optics.lens import Lens
 from dolens.photograph_page.page import ShownPhotograph
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.lens_camera import colours_of, distance_of, required_number
+from dolens.rendering.stray_light import Light, light_on_sensor, veil
 from dolens.rendering.whole_field import WholeField
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.colour import linear_to_srgb
@@ -81,11 +83,13 @@ class LensCamera:
         readout: noise and colour filters.
         distances: of the planes from the first vertex, mm; infinity where the field has a plane
             far away.
+        stray_light: adds lights and stray light to an image; None: nothing.
     """
 
     field: WholeField
     readout: Readout
     distances: tuple[float, ...]
+    stray_light: "StrayLight | None" = None
 
     @classmethod
     def of(
@@ -126,7 +130,10 @@ class LensCamera:
         """
         texture = self.field.texture(picture)
         for number, distance in enumerate(self.distances):
-            signal = read_out(self.field.image(texture, number), self.readout, seed)
+            light = self.field.image(texture, number)
+            if self.stray_light is not None:
+                light = self.stray_light.added_to(light, self.field.imaging, number)
+            signal = read_out(light, self.readout, seed)
             image = linear_to_srgb(self.readout.develop(signal))
             truth = linear_to_srgb(self.field.truth(texture, number))
             yield Photograph(image, truth, signal, self, distance)
@@ -147,6 +154,34 @@ class LensCamera:
             f"{width:.3g}×{height:.3g} mm{filters}; {waves} nm; {noise}; point spread functions at "
             f"{renderer.fields[1]}×{renderer.fields[0]} places, diffraction: {renderer.diffraction}"
         )
+
+
+@dataclass(frozen=True)
+class StrayLight:
+    """Lights and ghosts are added to images of a lens.
+
+    Attributes:
+        lens: the camera's.
+        lights: in the picture.
+        sensor_reflectance: share of the light that the sensor reflects.
+    """
+
+    lens: Lens
+    lights: tuple[Light, ...]
+    sensor_reflectance: float = 0.0
+
+    @torch.no_grad()
+    def added_to(self, image: Tensor, imaging: ImagingSystem, plane: int) -> Tensor:
+        """Return an image (3, H, W) in linear light with its veil, and with the lights' own images
+        and ghosts.
+        """
+        given = (self.lens, imaging, plane)
+        glare = veil(*given, self.sensor_reflectance).to(image)[:, None, None]
+        whole = image + glare * image.mean((-2, -1), keepdim=True)
+        if not self.lights:
+            return whole
+        found = light_on_sensor(*given, self.lights, sensor_reflectance=self.sensor_reflectance)
+        return whole + found.to(image)
 
 
 def readout_in(light: float | None, read_noise: float, pattern: str | None = None) -> Readout:

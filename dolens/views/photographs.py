@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +32,8 @@ class PhotographViews:
         pixel_pitch: float | None = None,
         diffraction: str | None = None,
         seed: int = 0,
+        lights: Sequence[Sequence[float]] | None = None,
+        sensor_reflectance: float = 0.0,
     ) -> Photograph:
         """Return what a sensor behind the lens sees of a picture, which is a plane before it.
 
@@ -66,6 +70,11 @@ class PhotographViews:
             pixel_pitch: mm; None: a pixel of the picture is one of the sensor.
             diffraction: `none`, `limit` or `wave`; None: where it shows, by the model it needs.
             seed: of the noise.
+            lights: points that are brighter than white by far, each a row and a column of the
+                picture and its power over that of a white pixel, one number or three; with their
+                ghosts, and the veil of the scene's own (see `dolens.rendering.stray_light`).  An
+                empty list: the veil alone; None: no stray light.
+            sensor_reflectance: share of the light that the sensor reflects, for ghosts.
 
         Returns:
             A `Photograph`: `image` and `truth` (3, H, W), sRGB; `save(path)`; it shows itself in a
@@ -77,7 +86,8 @@ class PhotographViews:
         """
         from dolens.errors import InputError
         from dolens.rendering.lens_camera import required_number, sensor_behind
-        from dolens.rendering.photograph import LensCamera, readout_in
+        from dolens.rendering.photograph import LensCamera, StrayLight, readout_in
+        from dolens.rendering.stray_light import lights_of
         from dolens.sensor.display import linear_picture
 
         lens = as_lens(self)
@@ -93,4 +103,10 @@ class PhotographViews:
         height, width = linear.shape[-2:]
         pixels = sensor_behind(lens, (height, width), sensor, pixel_pitch)
         camera = LensCamera.of(lens, pixels, readout, distances, diffraction)
+        if lights is not None:
+            share = required_number(
+                "sensor_reflectance", sensor_reflectance, 1.0, "of the light", from_zero=True
+            )
+            found = tuple(lights_of(lights, (height, width), pixels))
+            camera = replace(camera, stray_light=StrayLight(lens, found, share))
         return next(camera.photographs(linear, seed))

@@ -175,6 +175,13 @@ def test_coated_returns_a_copy():
         coated(lens, {9: "none"})
 
 
+@pytest.mark.parametrize("suffix", [".txt", ".zmx", ".seq"])
+def test_formats_without_coatings_refuse_them(suffix, tmp_path):
+    lens = dolens.load_lens("cooke_triplet").coated({2: "none"})
+    with pytest.raises(InputError, match=f"surface 2: a {suffix} file cannot hold 'coating'"):
+        dolens.save_lens(lens, tmp_path / f"lens{suffix}")
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_derivatives_of_the_share_are_those_of_differences(dtype):
     lens = coated(dolens.load_lens("cooke_triplet", dtype=dtype), "quarter_wave")

@@ -36,6 +36,15 @@ REFUSED = {
         for name in ("phone", "phone_insensitive")
         for suffix in (".txt", ".seq")
     },
+    **{
+        (name, suffix): what
+        for name in ("coated_window", "textbook_window")
+        for suffix, what in {
+            ".zmx": "surface 1: a .zmx file cannot hold 'coating'",
+            ".txt": "surface 1: a .txt file cannot hold material 'SCHOTT:N-BK7'",
+            ".seq": "surface 3: a .seq file cannot hold type 'paraxial_lens'",
+        }.items()
+    },
 }
 FORMATS = {
     ".txt": lambda data: prescription_from_diffoptics(diffoptics_text_of(data)),

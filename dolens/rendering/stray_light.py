@@ -1,0 +1,236 @@
+"""Lights in a picture, and the stray light that they and all of the scene bring to the sensor.
+
+A light is a point that is brighter than white by far: the sun, a lamp.  Its rays are followed to
+the sensor along the image's path and along all ghost paths (see `dolens.analysis.ghosts`), and
+summed over pixels.  The ghosts of all else in the picture are spread out: a veil as bright as the
+mean of the picture times the power of ghosts over that of the image.
+
+A white texel of the area A and the radiance L, seen from a distance d at the angle θ, gives the
+irradiance L·A·cos³θ/d² in front of the lens.  On the axis of the sensor white has the irradiance
+π·L·sin²θ', θ' being the half angle of the axial beam.  Their quotient turns what ghosts tell,
+irradiance over that in front of the lens, into shares of white.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.conditions import conditions
+from dolens.analysis.ghosts import ENTERING, IMAGE, chosen_paths, ghost_light
+from dolens.errors import InputError
+from dolens.kernels import rendering
+from dolens.optics.field_and_aperture import in_double_precision
+from dolens.optics.lens import Lens
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.scene.scene import bilinear
+from dolens.sensor.pixels import Sensor
+
+# Rays of a light that a cell of a ghost's grid has on average: their scatter must not show.
+_RAYS_A_CELL = 40.0
+_LARGEST_CELL = 64
+# Cells of a grid around the sensor, for splines.
+_MARGIN = 2
+# Fields whose ghosts make the veil, over areas that are alike, and their rays.
+_VEIL_FIELDS, _VEIL_RAYS = 4, 1000
+
+
+class Light(NamedTuple):
+    """A light in a picture.
+
+    Attributes:
+        row: pixels from the top of the sensor's upright image.
+        column: pixels from the left.
+        power: of the light of one white pixel there; of red, green and blue.
+    """
+
+    row: float
+    column: float
+    power: tuple[float, float, float]
+
+
+def light_on_sensor(
+    lens: Lens,
+    imaging: ImagingSystem,
+    plane: int,
+    lights: Sequence[Light],
+    rays: int = 20_000,
+    sensor_reflectance: float = 0.0,
+) -> Tensor:
+    """Return the image and the ghosts of lights, (C, height, width), in shares of white.
+
+    Differentiable in the lens's shapes, gaps and coatings.  A surface without a coating reflects as
+    bare glass.
+
+    Args:
+        lens: of the imaging system.
+        imaging: planes, C wavelengths, pixels and pupil.
+        plane: number of the plane that the lights are in, from 0.
+        lights: at most as many as patience allows: each takes rays along all paths.
+        rays: of each light, path and wavelength.
+        sensor_reflectance: share of the light that the sensor reflects.
+
+    Raises:
+        InputError: as `dolens.analysis.ghosts.ghosts` does.
+    """
+    lens, sensor = in_double_precision(lens), imaging.sensor
+    scene, system = imaging.scene, lens.system()
+    depth, scale = scene.depths[plane], scene.magnifications(system)[plane]
+    paths = chosen_paths(lens, 2, sensor_reflectance > 0.0, None)
+    white = math.pi * _axial_aperture(imaging)
+    channels = []
+    for channel, wavelength in enumerate(scene.wavelengths):
+        grids: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = defaultdict(list)
+        for light in lights:
+            x, y = _object_point(light, sensor, scale)
+            cosine = depth / math.hypot(x, y, depth)
+            factor = light.power[channel] * cosine**3 / (scale * depth) ** 2 / white
+            if factor == 0.0:
+                continue
+            where = conditions(lens, [(x, y)], [wavelength], depth)
+            for part in ghost_light(lens, where, paths, rays, sensor_reflectance):
+                if part.path == ENTERING or not len(part.light):
+                    continue
+                rows, columns = sensor.pixels(*part.points.unbind(-1))
+                cell = 1 if part.path == IMAGE else _cell(rows, columns)
+                grids[cell].append((rows, columns, factor * part.light))
+        shape = (sensor.height, sensor.width)
+        found = [_on_pixels(cell, parts, shape) for cell, parts in grids.items()]
+        zero = torch.zeros(shape, dtype=torch.float64, device=lens.device)
+        channels.append(sum(found, zero))
+    return torch.stack(channels)
+
+
+def _axial_aperture(imaging: ImagingSystem) -> float:
+    """Return sin²θ' of the beam to the sensor's centre."""
+    pupil = imaging.pupil.numbers()
+    length = float(imaging.system.vertices[-1].detach()) - float(pupil.z)
+    square = float(pupil.axial_radius) ** 2
+    return square / (square + length * length)
+
+
+def _object_point(light: Light, sensor: Sensor, scale: float) -> tuple[float, float]:
+    """Return x and y (mm) of a light on the object plane, which a pinhole images upright."""
+    pitch = sensor.pixel_pitch / scale
+    column = light.column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+    row = light.row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+    return column * pitch, -row * pitch
+
+
+@torch.no_grad()
+def _cell(rows: Tensor, columns: Tensor) -> int:
+    """Return the side, in pixels, of cells that hold enough of a ghost's rays; a power of two."""
+    if len(rows) < 2:
+        return _LARGEST_CELL
+    # An ellipse that is evenly lit has the area 4π·√det of its variances.
+    covariance = torch.cov(torch.stack((rows, columns)))
+    area = 4.0 * math.pi * math.sqrt(max(float(torch.linalg.det(covariance)), 0.0))
+    side = math.sqrt(_RAYS_A_CELL * area / len(rows))
+    return min(_LARGEST_CELL, 2 ** max(0, math.ceil(math.log2(max(side, 1.0)))))
+
+
+def _on_pixels(
+    cell: int, parts: list[tuple[Tensor, Tensor, Tensor]], shape: tuple[int, int]
+) -> Tensor:
+    """Sum light (mm² over mm² of a pixel in white) over cells, and interpolate it on pixels."""
+    rows, columns, light = (torch.cat(part) for part in zip(*parts, strict=True))
+    rows, columns = ((p + 0.5) / cell - 0.5 + _MARGIN for p in (rows, columns))
+    size = math.ceil(max(shape) / cell) + 2 * _MARGIN
+    inside = (rows > 0.0) & (rows < size - 1.0) & (columns > 0.0) & (columns < size - 1.0)
+    near = (p[inside][None] for p in (rows, columns, light))
+    grid = rendering.splat(*near, size)[0] / float(cell * cell)
+    if cell == 1:
+        ends = [_MARGIN + side for side in shape]
+        return grid[_MARGIN : ends[0], _MARGIN : ends[1]]
+    places = [
+        (torch.arange(side, dtype=grid.dtype, device=grid.device) + 0.5) / cell - 0.5 + _MARGIN
+        for side in shape
+    ]
+    return bilinear(grid[None], *torch.meshgrid(*places, indexing="ij"))[0]
+
+
+@torch.no_grad()
+def veil(lens: Lens, imaging: ImagingSystem, plane: int, sensor_reflectance: float = 0.0) -> Tensor:
+    """Return the power of ghosts on the sensor over that of the image, (C,): the mean over the
+    picture's area.
+
+    Args:
+        lens: of the imaging system.
+        imaging: planes, wavelengths and pixels.
+        plane: number of the plane, from 0.
+        sensor_reflectance: share of the light that the sensor reflects.
+    """
+    lens, sensor, scene = in_double_precision(lens), imaging.sensor, imaging.scene
+    depth, scale = scene.depths[plane], scene.magnifications(lens.system())[plane]
+    corner = 0.5 * math.hypot(sensor.width, sensor.height) * sensor.pixel_pitch
+    paths = chosen_paths(lens, 2, sensor_reflectance > 0.0, None)
+    found = []
+    for wavelength in scene.wavelengths:
+        ghosts = image = 0.0
+        for number in range(_VEIL_FIELDS):
+            height = corner * math.sqrt((number + 0.5) / _VEIL_FIELDS) / scale
+            where = conditions(lens, [(0.0, height)], [wavelength], depth)
+            for part in ghost_light(lens, where, paths, _VEIL_RAYS, sensor_reflectance):
+                if part.path == ENTERING:
+                    continue
+                caught = float((part.light * _caught(part.points, sensor)).sum())
+                if part.path == IMAGE:
+                    image += caught
+                else:
+                    ghosts += caught
+        found.append(ghosts / image if image > 0.0 else 0.0)
+    return torch.tensor(found, dtype=torch.float64, device=lens.device)
+
+
+def _caught(points: Tensor, sensor: Sensor) -> Tensor:
+    """Return which points (N, 2), mm, lie on the sensor."""
+    rows, columns = sensor.pixels(*points.unbind(-1))
+    inside = (rows > -0.5) & (rows < sensor.height - 0.5)
+    return inside & (columns > -0.5) & (columns < sensor.width - 0.5)
+
+
+def lights_of(
+    given: Sequence[Sequence[float]], picture: tuple[int, int], sensor: Sensor
+) -> list[Light]:
+    """Return lights as a user names them.
+
+    Args:
+        given: row and column, in pixels of the picture, and the power over that of a white pixel of
+            it: one number or three.
+        picture: its height and width, pixels; it fills the sensor.
+        sensor: the pixels.
+
+    Raises:
+        InputError: a light that has other numbers, none of them finite, or lies beside the picture.
+    """
+    height, width = picture
+    found = []
+    for number, one in enumerate(given, 1):
+        try:
+            row, column, *power = (float(value) for value in one)
+        except (TypeError, ValueError):
+            row, power = math.nan, []
+        if len(power) not in (1, 3) or not all(0.0 <= p < math.inf for p in power):
+            raise InputError(
+                f"lights: number {number} is {one}; allowed: row, column, and the power over that "
+                "of a white pixel, one number or three, 0 or more"
+            )
+        if not (-0.5 <= row <= height - 0.5 and -0.5 <= column <= width - 0.5):
+            raise InputError(
+                f"lights: number {number} is at row {row:g}, column {column:g}; allowed: within "
+                f"the picture of {height} × {width} pixels"
+            )
+        down, across = sensor.height / height, sensor.width / width
+        red, green, blue = (power * 3)[:3] if len(power) == 1 else power
+        area = down * across
+        found.append(
+            Light(
+                (row + 0.5) * down - 0.5,
+                (column + 0.5) * across - 0.5,
+                (red * area, green * area, blue * area),
+            )
+        )
+    return found

@@ -1,0 +1,116 @@
+"""Lights in pictures: their own light, their ghosts, and what is refused."""
+
+import math
+
+import pytest
+import torch
+
+from dolens import InputError, load_lens
+from dolens.analysis.conditions import conditions
+from dolens.analysis.ghosts import ghosts
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.stray_light import Light, light_on_sensor, lights_of, veil
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+GREEN = 550.0
+# 18 mm by 18 mm behind a triplet of f = 50 mm.
+SENSOR = Sensor(61, 61, 0.3)
+FAR = 1e6
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return load_lens("cooke_triplet").coated("none").requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def imaging(bare):
+    return ImagingSystem.of(bare.system(), PlanarScene((FAR,), (GREEN,)), SENSOR)
+
+
+def light(row, column, power=100.0):
+    return Light(row, column, (power, power, power))
+
+
+def test_a_light_brings_as_much_light_as_so_many_white_pixels(bare, imaging):
+    """The white of an axial pixel is 1 behind an ideal lens: behind this one what passes."""
+    passed = float(bare.transmission(0.0, GREEN).share)
+    image = light_on_sensor(bare, imaging, 0, [light(30, 30)], rays=800)[0]
+    around = image[27:34, 27:34]
+    assert float(around.sum()) == pytest.approx(100.0 * passed, rel=0.015)
+    assert divmod(int(image.argmax()), 61) == (30, 30)
+
+
+def test_it_is_imaged_upright(bare, imaging):
+    image = light_on_sensor(bare, imaging, 0, [light(12, 45)], rays=200)[0]
+    row, column = divmod(int(image.argmax()), 61)
+    # The lens's own distortion draws it towards the axis by less than a pixel.
+    assert abs(row - 12) <= 1 and abs(column - 45) <= 1
+
+
+def test_ghosts_have_the_power_that_their_analysis_gives(bare, imaging):
+    """Over the image's power, for a light on the axis; other rays, and a square for a circle."""
+    found = light_on_sensor(bare, imaging, 0, [light(30, 30)], rays=800)[0]
+    own = float(found[27:34, 27:34].sum())
+    stray = float(found.sum()) - own
+    known = ghosts(bare, conditions(bare, [0.0], [GREEN]), rays=800)
+    inside = [r < 9.0 for r in known.measures.rms.nan_to_num(math.inf).tolist()]
+    least = sum(p for p, small in zip(known.measures.power.tolist(), inside, strict=True) if small)
+    assert 0.5 * least < stray / own < 1.1 * known.total
+
+
+def test_coatings_quench_ghosts(bare, imaging):
+    coated = bare.coated("quarter_wave").requires_grad_(False)
+    both = [float(veil(lens, imaging, 0)) for lens in (bare, coated)]
+    # Two reflections of some 1 % in the place of 5 %.
+    assert both[0] > 0.005 and both[1] < 0.15 * both[0]
+
+
+def test_the_derivative_of_stray_light_is_that_of_its_number(imaging):
+    lens = load_lens("cooke_triplet").coated("quarter_wave").requires_grad_(False)
+    name = "surfaces.5.coating.thickness_1"
+    at = dict(lens.named_parameters())[name].detach()
+
+    def total(value):
+        given = lens.with_values({name: value})
+        return light_on_sensor(given, imaging, 0, [light(20, 40)], rays=80).sum()
+
+    value = at.clone().requires_grad_()
+    slope = float(torch.autograd.grad(total(value), value)[0])
+    around = [float(total(at + step)) for step in (1e-2, -1e-2)]
+    assert slope == pytest.approx((around[0] - around[1]) / 2e-2, rel=1e-5)
+
+
+def test_a_photograph_has_its_lights(bare):
+    dark = torch.full((3, 40, 60), 0.1)
+    plain = bare.photograph(dark, distance=math.inf, light=None)
+    veiled = bare.photograph(dark, distance=math.inf, light=None, lights=[])
+    lit = bare.photograph(dark, distance=math.inf, light=None, lights=[(10, 45, 1e4)])
+    assert bool((veiled.signal > plain.signal).all())
+    assert divmod(int(lit.signal[1].argmax()), 60) == (10, 45)
+    # Its ghosts are seen far from it.
+    assert float((lit.signal - veiled.signal)[:, 20:, :30].amax()) > 0.01
+
+
+def test_lights_are_named_by_pixels_of_the_picture():
+    (found,) = lights_of([(0, 0, 8.0)], (10, 20), Sensor(20, 40, 0.1))
+    # Half a texel from the corner; one of its pixels is four of the sensor's.
+    assert found == Light(0.5, 0.5, (32.0, 32.0, 32.0))
+    (red,) = lights_of([(3, 4, 1.0, 0.5, 0.25)], (10, 20), Sensor(10, 20, 0.1))
+    assert red == Light(3.0, 4.0, (1.0, 0.5, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("lights", "message"),
+    [
+        ([(1, 2)], "number 1 is .*allowed: row, column, and the power"),
+        ([(1, 2, 3), (1, 2, -3)], "number 2 is"),
+        ([(1, 2, math.inf)], "number 1"),
+        ([("a", 2, 3)], "number 1"),
+        ([(10, 2, 3)], "row 10, column 2; allowed: within the picture of 10 × 20 pixels"),
+    ],
+)
+def test_what_is_no_light_is_refused(lights, message):
+    with pytest.raises(InputError, match=message):
+        lights_of(lights, (10, 20), Sensor(10, 20, 0.1))
