@@ -34,6 +34,7 @@ from dolens.analysis.conditions import Conditions
 from dolens.errors import InputError, check_count
 from dolens.optics.aiming import field_line, launch
 from dolens.optics.field_and_aperture import in_double_precision
+from dolens.optics.ghost_losses import GhostLosses
 from dolens.optics.ghost_optics import GhostFirstOrder, NormalIncidence, ghosts_first_order
 from dolens.optics.ghost_paths import (
     Path,
@@ -45,7 +46,7 @@ from dolens.optics.ghost_paths import (
 )
 from dolens.optics.image_surface import WITHOUT_EDGE
 from dolens.optics.lens import Lens
-from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.ray_tracing import choose_backend, trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.system import OpticalSystem
@@ -55,12 +56,16 @@ BLOCKS = 8
 # The plastic number's inverse powers: steps of a lattice that covers a square evenly (Roberts,
 # 2018), whatever the number of points.
 _STEPS = (0.7548776662466927, 0.5698402909980532)
+# Rays that tell of a size.
+_FEWEST = 10.0
 # Rings and azimuths of the front surface whose light is looked for, and room about them.
 _RINGS, _AZIMUTHS, _ROOM = 8, 72, 1.01
 
 
 class GhostMeasures(NamedTuple):
     """P paths are measured by real rays, each number (P,); NaN where no light arrives.
+
+    Fewer than ten rays tell nothing of a ghost's size: their irradiance and RMS are NaN, too.
 
     Attributes:
         share: power at the sensor over that of the light that enters the front surface.
@@ -166,7 +171,7 @@ def ghosts(
     where = where.that_count()
     radius = 0.5 * lens.sensor_diameter if lens.sensor_diameter else math.inf
     places = {ENTERING: 0, IMAGE: 1} | {path: place for place, path in enumerate(chosen, 2)}
-    sums = torch.zeros(len(places), BLOCKS, 6, dtype=torch.float64)
+    sums = torch.zeros(len(places), BLOCKS, 7, dtype=torch.float64)
     count = 0
     for path, points, light, block in ghost_light(lens, where, chosen, rays, sensor_reflectance):
         if path == ENTERING:
@@ -180,7 +185,9 @@ def ghosts(
     # Of a path without light: the share of one ray.
     least = torch.stack([normal.share(path) for path in chosen]).cpu() / count
     found, errors, image = _with_errors(sums[1:], sums[0, :, 0], smallest, least)
-    order = found.irradiance.argsort(descending=True, stable=True)
+    # Behind all others come those of unknown size, and then those without light.
+    bright = found.irradiance.nan_to_num(0.0) + 1e-30 * found.share
+    order = bright.argsort(descending=True, stable=True)
     return Ghosts(
         where,
         tuple(chosen[number] for number in order.tolist()),
@@ -262,23 +269,35 @@ def ghost_light(
         if not len(front.weight):
             field = tuple(where.fields[0].tolist())
             raise InputError(f"ghosts: no light of field {field} enters the front surface")
+        losses = GhostLosses(system, wave)
         yield GhostLight(ENTERING, front.landed, share * front.weight, front.block)
-        yield _arriving(IMAGE, system, front.rays, share * front.weight, front.block)
+        yield _arriving(IMAGE, system, losses, front.rays, share * front.weight, front.block)
         for path, ghost in zip(paths, ghost_path_systems(system, paths, catching), strict=True):
             beam, weight, block = front.of(path)
             if len(weight):
                 left = share * sensor_reflectance ** path.count(sensor)
-                yield _arriving(path, ghost, beam, left * weight, block)
+                yield _arriving(path, ghost, losses, beam, left * weight, block)
 
 
 def _arriving(
-    path: Path, system: OpticalSystem, rays: Rays, weight: Tensor, block: Tensor
+    path: Path,
+    system: OpticalSystem,
+    losses: GhostLosses,
+    rays: Rays,
+    weight: Tensor,
+    block: Tensor,
 ) -> GhostLight:
-    """Trace rays of a path, those that arrive also with the share of light that is left."""
-    hit = trace_rays(system, rays)
+    """Trace rays of a path, and find the share of light that is left of those that arrive."""
+    by_kernel = choose_backend(system, rays) == "cpu"
+    series = losses.of(path, system) if by_kernel else None
+    hit = trace_rays(system, rays, losses=series)
     kept = torch.nonzero(hit.valid)[:, 0]
-    beam = Rays(rays.position[kept], rays.direction[kept], rays.wavelength)
-    passed = trace_rays(system, beam, transmission=True).transmission
+    passed = hit.transmission
+    if passed is not None:
+        passed = passed[kept]
+    else:
+        beam = Rays(rays.position[kept], rays.direction[kept], rays.wavelength)
+        passed = trace_rays(system, beam, transmission=True).transmission
     assert passed is not None  # it was asked for
     return GhostLight(path, hit.position[kept, :2], weight[kept] * passed, block[kept])
 
@@ -365,11 +384,11 @@ def front_box(system: OpticalSystem, line: Tensor, near: float) -> tuple[Tensor,
 
 
 def _sums(points: Tensor, light: Tensor, block: Tensor, radius: float) -> Tensor:
-    """Return moments (blocks, 6) of light on the sensor: 1, x, y, x², xy, y²."""
+    """Return moments (blocks, 7) of light on the sensor: 1, x, y, x², xy, y²; and how many rays."""
     x, y = points.unbind(-1)
     light = light * (x * x + y * y < radius * radius)
     lx, ly = light * x, light * y
-    moments = (light, lx, ly, lx * x, lx * y, ly * y)
+    moments = (light, lx, ly, lx * x, lx * y, ly * y, (light > 0.0).double())
     sums = [torch.bincount(block, moment, minlength=BLOCKS) for moment in moments]
     return torch.stack(sums, -1).cpu()
 
@@ -380,7 +399,7 @@ def _with_errors(
     """Return measures, their standard errors, and the image's share with its error.
 
     Args:
-        sums: (1 + P, blocks, 6), the image's first.
+        sums: (1 + P, blocks, 7), the image's first.
         entering: (blocks,).
         smallest: (P,), mm²: no ghost is smaller than a disc of diffraction.
         least: (P,), error of the share where no ray arrives.
@@ -403,16 +422,17 @@ def _with_errors(
 
 
 def _measures(sums: Tensor, front: Tensor, smallest: Tensor) -> list[Tensor]:
-    """Return the share (B, 1 + P), and the other `GhostMeasures` (B, P), of sums (B, 1 + P, 6)."""
-    light, lx, ly, lxx, lxy, lyy = sums.unbind(-1)
+    """Return the share (B, 1 + P), and the other `GhostMeasures` (B, P), of sums (B, 1 + P, 7)."""
+    light, lx, ly, lxx, lxy, lyy, rays = sums.unbind(-1)
     share = light / front[:, None]
-    light, lx, ly, lxx, lxy, lyy = (v[:, 1:] for v in (light, lx, ly, lxx, lxy, lyy))
+    light, lx, ly, lxx, lxy, lyy, rays = (v[:, 1:] for v in (light, lx, ly, lxx, lxy, lyy, rays))
     x, y = lx / light, ly / light
     xx, xy, yy = lxx / light - x * x, lxy / light - x * y, lyy / light - y * y
     power = share[:, 1:] / share[:, :1]
     area = ghost_area(xx, xy, yy, smallest)
-    irradiance = torch.where(light > 0.0, light / area, 0.0)
-    rms = (xx + yy).clamp(min=0.0).sqrt()
+    few = (rays > 0.0) & (rays < _FEWEST)
+    irradiance = torch.where(light > 0.0, light / area, 0.0).masked_fill(few, math.nan)
+    rms = (xx + yy).clamp(min=0.0).sqrt().masked_fill(few, math.nan)
     power = torch.where(share[:, :1] > 0.0, power, math.nan)
     return [share, power, irradiance, x, y, rms]
 
