@@ -144,12 +144,16 @@ def trace_polarised(system: OpticalSystem, rays: Rays) -> PolarisedRays:
     passed = torch.exp(-field.absorbed) if isinstance(field.absorbed, Tensor) else 1.0
     traced = trace_to_sensor(system, replace(traced, shares=[Shares(passed, 1.0)]), wavelength)
     media = math.prod(share.medium for share in traced.shares or [])
-    root = media.sqrt() if isinstance(media, Tensor) else None
+    power = media * field.flux
+    root = None
+    if isinstance(power, Tensor):
+        # What is held here are rays that no light follows.
+        root = power.clamp(min=torch.finfo(power.dtype).tiny ** 0.5).sqrt()
     return _joined(traced_rays(replace(traced, shares=None), before), field, root)
 
 
 def _joined(rays: TracedRays, field: "_Field", root: Tensor | None) -> PolarisedRays:
-    """Join what was found for users; the root is that of the glasses' transmittances."""
+    """Join what was found for users; the root is that of fluxes and of glasses' transmittances."""
     valid = rays.valid
 
     def joined(columns: tuple[Vector, ...]) -> Tensor:
@@ -175,6 +179,7 @@ class _Field:
         front: u₁, u₂, k in front of the lens, in its axes.
         behind: the same, carried behind the last surface.
         jones: J₁₁, J₁₂, J₂₁, J₂₂; empty where no surface changes the field.
+        flux: ∏ n'·cos θ'/(n·cos θ) of the surfaces with a coating.
         absorbed: Σ a·t, of the glasses' absorption up to the last surface.
     """
 
@@ -188,6 +193,7 @@ class _Field:
         self.front = (*_axes_across(k), k)
         self.behind = self.front
         self.jones: list[Parts] = []
+        self.flux: Tensor | float = 1.0
         self.absorbed: Tensor | float = 0.0
         absorptions = system.absorptions(wavelength)
         for crossing in crossings:
@@ -209,8 +215,11 @@ class _Field:
             w = _dot(n, u), _dot(n, v)
         if surface.coating is not None:
             cosine = _dot(n, k).abs().clamp(max=1.0)
-            t, g = _effect(surface.coating, mirror, crossing.indices, cosine, w, self.wavelength)
+            t, g, flux = _effect(
+                surface.coating, mirror, crossing.indices, cosine, w, self.wavelength
+            )
             self._pass(t, g, w)
+            self.flux = flux if isinstance(self.flux, float) else self.flux * flux
         if not refracts:
             return
         onward = _to_lens(crossing, crossing.leaving)
@@ -225,10 +234,10 @@ class _Field:
         rows = [g.times(w[0]), g.times(w[1])]
         if not self.jones:
             off = rows[0].times(w[1])
-            self.jones = [t.plus(rows[0].times(w[0])), off, off, t.plus(rows[1].times(w[1]))]
+            self.jones = [t.plus(rows[0], w[0]), off, off, t.plus(rows[1], w[1])]
             return
         upper, lower = self.jones[:2], self.jones[2:]
-        along = [a.times(w[0]).plus(b.times(w[1])) for a, b in zip(upper, lower, strict=True)]
+        along = [a.times(w[0]).plus(b, w[1]) for a, b in zip(upper, lower, strict=True)]
         self.jones = [
             t.product(j).plus(row.product(n))
             for row, given in zip(rows, (upper, lower), strict=True)
@@ -243,27 +252,27 @@ def _effect(
     cosine: Tensor,
     w: tuple[Tensor, Tensor],
     wavelength: float | Tensor,
-) -> tuple[Parts, Parts]:
-    """Return t_s and (t_p - t_s)/sin² of a surface as roots of power, of a mirror -r_s and
-    (r_p + r_s)/sin².
+) -> tuple[Parts, Parts, Tensor | float]:
+    """Return t_s, (t_p - t_s)/sin² and n'·cos θ'/(n·cos θ) of a surface; of a mirror -r_s,
+    (r_p + r_s)/sin² and 1.
     """
     n, m = indices
     if mirror:
         found = coating.amplitudes(n, m, cosine, wavelength)
         r_s, r_p = Parts.of(found.r_s), Parts.of(found.r_p)
-        return r_s.times(-1.0), r_p.plus(r_s).times(_over_square(w))
+        return r_s.times(-1.0), r_p.plus(r_s).times(_over_square(w)), 1.0
     q = n * cosine
     # Held above zero, where the root has a derivative; no ray goes on there.
     p = ((m - n) * (m + n) + q * q).clamp(min=torch.finfo(q.dtype).tiny ** 0.5).sqrt()
-    root = (p / q.clamp(min=torch.finfo(q.dtype).tiny ** 0.25)).sqrt()
+    flux = p / q.clamp(min=torch.finfo(q.dtype).tiny ** 0.25)
     if isinstance(coating, Stack) and not coating.films:
         # In Fresnel's equations the square of the sine is a factor of the difference.
         s = 2.0 * q / (q + p)
         bend = (n - m) * (n - m) * (n + m) * n * n
         g = bend * s / ((m * q + n * p) * (m * m * q + n * n * p))
-        return Parts(root * s), Parts(root * g)
+        return Parts(s), Parts(g), flux
     of_s, of_p = coating.transmitted(n, m, cosine, wavelength)
-    return of_s.times(root), of_p.minus(of_s).times(root * _over_square(w))
+    return of_s, of_p.plus(of_s, -1.0).times(_over_square(w)), flux
 
 
 def _over_square(w: tuple[Tensor, Tensor]) -> Tensor:

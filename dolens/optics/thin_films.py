@@ -70,14 +70,14 @@ class Parts(NamedTuple):
         i = self.imaginary
         return Parts(self.real * real, None if i is None else i * real)
 
-    def plus(self, other: "Parts") -> "Parts":
-        """Return the sum."""
+    def plus(self, other: "Parts", real: Tensor | float = 1.0) -> "Parts":
+        """Return the sum with another number times a real one."""
         i, j = self.imaginary, other.imaginary
-        return Parts(self.real + other.real, j if i is None else i if j is None else i + j)
-
-    def minus(self, other: "Parts") -> "Parts":
-        """Return the difference."""
-        return self.plus(other.times(-1.0))
+        if i is not None and j is not None:
+            i = _sum(i, j, real)
+        elif j is not None:
+            i = j * real
+        return Parts(_sum(self.real, other.real, real), i)
 
     def product(self, other: "Parts") -> "Parts":
         """Return the product."""
@@ -87,6 +87,12 @@ class Parts(NamedTuple):
         if d is None:
             return self.times(c)
         return Parts(torch.addcmul(a * c, b, d, value=-1.0), torch.addcmul(a * d, b, c))
+
+
+def _sum(a: Tensor, b: Tensor, real: Tensor | float) -> Tensor:
+    if isinstance(real, Tensor):
+        return torch.addcmul(a, b, real)
+    return torch.add(a, b, alpha=real)
 
 
 class _Boundary(NamedTuple):
