@@ -148,7 +148,8 @@ def jones_pupils(
     wave = waves.repeat(len(field))
     beam = find_beam(system, points, wave)
     middle = light_centroids(system, points, wave, beam)
-    wavefront = pupil_wavefront(system, points, wave, middle, samples, beam=beam)
+    # Each ray's own share is counted beside the light in front of the lens.
+    wavefront = pupil_wavefront(system.uncoated(), points, wave, middle, samples, beam=beam)
     stop, _ = stop_coordinates(system, points, wave, beam, samples)
     light = (wavefront.amplitude * wavefront.weight).where(stop.isfinite().all(-1), 0.0)
     light = (light / light.sum((-2, -1), keepdim=True)).nan_to_num(0.0)

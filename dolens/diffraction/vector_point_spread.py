@@ -153,7 +153,8 @@ def _added(
     """Return |E_x|², |E_y|², |E_z|² and the scalar irradiance, (4, M, M), 1/mm²."""
     beam = find_beam(system, points, coarse.wavelength)
     given = (coarse.wavelength, coarse.centre, side, 1.0 / coarse.curvature, beam)
-    front = pupil_wavefront(system, points, *given)
+    # What a ray loses is in its field.
+    front = pupil_wavefront(system.uncoated(), points, *given)
     flux = front.amplitude * front.weight
     pupil = polarised_pupil(system, points, front.wavelength, beam, flux)
     traced, (ahead, _) = pupil.traced, pupil.axes

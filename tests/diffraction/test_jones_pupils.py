@@ -17,7 +17,7 @@ from dolens.optics.jones import (
     retardance,
     retarder,
 )
-from dolens.optics.thin_films import amplitudes
+from dolens.optics.thin_films import amplitudes, shares
 from dolens.prescriptions.build import lens_from_prescription
 
 CROSSED = {"front": [{"polariser": 0}], "behind": [{"polariser": 90}]}
@@ -60,6 +60,14 @@ def test_a_spherical_surface_between_crossed_polarisers_shows_the_maltese_cross(
     turn = torch.rad2deg(torch.atan2(y, x)) - axis[0, 0]
     assert float(torch.sin(torch.deg2rad(turn))[inside].abs().max()) < 1e-9
     assert float(found.retardance[0][0, 0][inside].max()) < 1e-10
+    # The mean is over the disc of the stop.
+    alone = pupils(lens)
+    r = 4.0 * ((torch.arange(400).double() + 0.5) / 400).sqrt()
+    cosine = (1.0 - (r / 8.0) ** 2).sqrt()
+    t = shares(1.0, [], 1.7, cosine, 587.5618)
+    mean = float((0.5 * (t.t_s + t.t_p)).mean())
+    assert float(alone.transmission) == pytest.approx(mean, abs=1e-4)
+    assert float(alone.scalar) == pytest.approx(float(alone.transmission), rel=1e-13)
 
 
 def test_light_at_an_angle_through_a_plane_is_partly_polarised():
@@ -101,6 +109,8 @@ def test_a_coating_retards_and_bare_glass_on_the_axis_does_not():
     assert float(coated.diattenuation[0][inside].max()) < 0.3 * float(
         bare.diattenuation[0][inside].max()
     )
+    # What each ray loses is no part of its weight.
+    assert torch.equal(bare.weight, coated.weight)
     close = bare.cartesian[inside] - bare.jones[inside]
     assert float(close.abs().max()) < 0.02
 

@@ -125,6 +125,19 @@ def test_at_low_aperture_fields_add_up_as_numbers():
     assert errors[0] < 2e-3 and errors[1] == pytest.approx(0.25 * errors[0], rel=0.2)
 
 
+def test_an_image_holds_what_the_lens_passes():
+    lens = dolens.load_lens("cooke_triplet").requires_grad_(False)
+    where = conditions(lens, fields=20, wavelengths=587.5618)
+    settings = {"cells": 12, "half_width_um": 60.0, "rays": 96}
+    ideal, bare = (
+        vector_point_spread(of, where, **settings).irradiance.sum()
+        for of in (lens, lens.coated("none"))
+    )
+    assert float(bare / ideal) == pytest.approx(0.7021, abs=2e-3)
+    step = 120.0 / 12
+    assert 0.8 < float(ideal) * step * step < 1.05
+
+
 def test_one_number_a_ray_is_the_scalar_field():
     lens = dolens.load_lens("cooke_triplet").requires_grad_(False)
     where = conditions(lens, fields=14, wavelengths=587.5618)
