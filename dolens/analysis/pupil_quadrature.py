@@ -152,6 +152,7 @@ def gaussian_quadrature(
     arms: int = 12,
     object_distance: float | None = None,
     symmetry: bool = True,
+    lost_light: bool = True,
 ) -> SpotRays:
     """Sample the vignetted pupil of each field on rings and arms by Gaussian quadrature.
 
@@ -174,6 +175,7 @@ def gaussian_quadrature(
     Rarely needed:
         symmetry: whether a part of the pupil may stand for its mirror images, where the lens has
             the symmetry.
+        lost_light: whether rays count by what of their light arrives, of a lens with coatings.
 
     Raises:
         InputError: a field whose light does not pass, or rings and arms out of range.
@@ -204,7 +206,7 @@ def gaussian_quadrature(
         launched[field] = Launched(
             aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
         )
-    return _passing(lens, fields, wavelengths, launched.__getitem__, symmetric)
+    return _passing(lens, fields, wavelengths, launched.__getitem__, symmetric, lost_light)
 
 
 def gaussian_rings(count: int, rim: bool = False) -> tuple[Tensor, Tensor]:
@@ -264,6 +266,7 @@ def _passing(
     wavelengths: Sequence[float],
     launch: Launch,
     symmetric: bool = False,
+    lost_light: bool = True,
 ) -> SpotRays:
     """Keep the rays that pass, of every field and wavelength, in the lens's precision."""
     options: dict[str, Any] = {"dtype": lens.dtype, "device": lens.device}
@@ -276,7 +279,9 @@ def _passing(
         position, direction, weight, whole = launches[field]
         position, direction = position.to(**options), direction.to(**options)
         system = lens.system()
-        hit = trace_rays(system, Rays(position, direction, nm), transmission=system.coated)
+        hit = trace_rays(
+            system, Rays(position, direction, nm), transmission=lost_light and system.coated
+        )
         valid = hit.valid
         launched += valid.numel()
         if not bool(valid.any()):

@@ -154,7 +154,9 @@ def transmission(lens: Lens, where: Conditions) -> Transmission:
     waves = where.wavelengths.tolist()
     found = []
     for rings, arms in (_PUPIL, _COARSE):
-        rays = gaussian_quadrature(exact, fields, waves, rings, arms, where.object_distance)
+        rays = gaussian_quadrature(
+            exact, fields, waves, rings, arms, where.object_distance, lost_light=False
+        )
         found.append(_means(exact, rays, (len(fields), len(waves))))
     share, surfaces, media = found[0]
     return Transmission(

@@ -9,7 +9,7 @@ meets them, as everywhere on a lens whose radii are far longer than a wavelength
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -78,6 +78,15 @@ class CoatingState:
         """Return the numbers that may be varied."""
         return ()
 
+    @property
+    def structure(self) -> Self:
+        """Return the coating without these numbers, hashable."""
+        return self
+
+    def with_tensors(self, values: Sequence[Tensor]) -> Self:
+        """Return a coating of this structure with other numbers."""
+        return self
+
     def behind(self, index: float | Tensor, wavelength: float | Tensor) -> Any:
         """Return the index of the substrate, or what is given where there is none."""
         return index if self.substrate is None else self.substrate.index(wavelength)
@@ -129,6 +138,15 @@ class Stack(CoatingState):
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the thicknesses."""
         return self.thicknesses
+
+    @property
+    def structure(self) -> Self:
+        """Return the films alone."""
+        return replace(self, thicknesses=())
+
+    def with_tensors(self, values: Sequence[Tensor]) -> Self:
+        """Return the same films with other thicknesses."""
+        return replace(self, thicknesses=tuple(values))
 
     def _layers(self, wavelength: float | Tensor) -> list[Layer]:
         # A mirror has no index, and no prescription names it as a film.

@@ -7,8 +7,8 @@ on from them to whatever a coating is made of.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from torch.nn.functional import pad
 from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
+from dolens.optics.coatings import CoatingState
+from dolens.optics.materials import Medium
 from dolens.optics.packing import LaidOut
 from dolens.optics.records import Records, tensor
 from dolens.optics.system import OpticalSystem
@@ -25,6 +27,8 @@ from dolens.optics.system import OpticalSystem
 # Steps that are no surfaces of the lens; a law deflects what its surface has passed.
 _BETWEEN = (Kind.CHANGE_AXES, Kind.LENS_AXES, Kind.SENSOR, Kind.DEFLECT)
 _GROUP = 4  # coefficients that a kernel takes at once
+# Lengths of series that are tried, and how many of the last coefficients must be small.
+_TERMS, _LAST = (8, 12, 16, 24, 32, 48, 64, 96, 128), 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,56 +101,150 @@ def series(shares: Tensor) -> Tensor:
     return shares.double() @ _transform(shares.shape[-1]).to(shares.device)
 
 
+class SurfaceSeries(NamedTuple):
+    """What one surface passes, or a mirror reflects, as a series.
+
+    Attributes:
+        coefficients: (W, K).
+        cosine: that it is a function of.
+        ratio: (W, 1), index in front over that beyond, for `Cosine.BEYOND`, else ones.
+    """
+
+    coefficients: Tensor
+    cosine: Cosine
+    ratio: Tensor
+
+
 def losses_of(
-    system: OpticalSystem,
-    wavelengths: Tensor,
-    terms: int = 12,
-    lowest: Mapping[int, float] | None = None,
-) -> Losses:
-    """Return the losses of a lens's coatings and glasses, for light towards the sensor.
+    system: OpticalSystem, wavelengths: Tensor, sense: float = 1.0, tolerance: float = 1e-12
+) -> Losses | None:
+    """Return the losses of a lens's coatings and glasses; None where no series of 128 terms or
+    fewer gives the shares of a surface.
 
     Args:
         system: the lens.
         wavelengths: (W,), nm.
-        terms: coefficients of each series: 12 err by some 1e-6 for bare glass and thin coatings at
-            all angles.
-        lowest: number of a surface → the lowest cosine of its rays; of others 0.
+        sense: +1 for light towards the sensor, -1 for light towards the object.
+        tolerance: of the shares: the largest of a series's last coefficients.
     """
-    waves = wavelengths.double().reshape(-1, 1)
-    indices = [torch.as_tensor(n).double().expand(waves.shape) for n in system.indices(waves)]
-    numbers, coefficients, cosines, ratios = [], [], [], []
+    waves = wavelengths.detach().double().reshape(-1, 1)
+    found: dict[int, SurfaceSeries] = {}
     for number, surface in enumerate(system.surfaces, 1):
-        coating = surface.coating
-        if coating is None:
-            continue
-        numbers.append(number)
-        front, behind = indices[number - 1], indices[number]
-        mirror = number in system.mirrors
-        beyond = coating.behind(behind, waves) if mirror else behind
-        ratio = front / beyond
-        thinner = not ratio.is_complex() and bool((ratio > 1.0).all())
-        thinner = thinner and surface.deflection is None
-        u = nodes(terms, (lowest or {}).get(number, 0.0)).expand(len(waves), terms)
-        cosine = Cosine.ARRIVING
-        if thinner:
-            cosine = Cosine.BEYOND if mirror else Cosine.LEAVING
-            u = (1.0 - (1.0 - u.square()) / ratio.square()).sqrt()
-        cosines.append(cosine)
-        ratios.append(ratio if cosine == Cosine.BEYOND else torch.ones_like(waves))
-        r_s, r_p, t_s, t_p = coating.shares(front, behind, u, waves)
-        coefficients.append(series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p)))
-    absorptions = [torch.as_tensor(a).double() for a in system.absorptions(waves[:, 0])]
+        if surface.coating is not None:
+            one = surface_series(system, number, waves[:, 0], sense, tolerance)
+            if one is None:
+                return None
+            found[number] = one
+    alphas = system.absorptions(waves[:, 0])
+    absorptions = [torch.as_tensor(alpha, dtype=torch.float64) for alpha in alphas]
     clear = not any(bool((a != 0.0).any()) for a in absorptions)
-    absorbed = torch.stack([a.expand(len(waves)) for a in absorptions])
-    empty = waves.new_zeros((0, len(waves), terms))
+    longest = max((one.coefficients.shape[-1] for one in found.values()), default=_GROUP)
+    padded = [
+        pad(one.coefficients, (0, longest - one.coefficients.shape[-1])) for one in found.values()
+    ]
+    cosines = tuple(one.cosine for one in found.values())
+    ratios = [one.ratio[:, 0] for one in found.values()]
     return Losses(
-        tuple(numbers),
-        torch.stack(coefficients) if numbers else empty,
-        tuple(cosines),
-        tuple((lowest or {}).get(number, 0.0) for number in numbers),
-        torch.stack(ratios)[..., 0] if Cosine.BEYOND in cosines else None,
-        None if clear else absorbed,
+        tuple(found),
+        torch.stack(padded) if padded else waves.new_zeros((0, len(waves), longest)),
+        cosines,
+        (),
+        torch.stack(ratios) if Cosine.BEYOND in cosines else None,
+        None if clear else torch.stack([a.expand(len(waves)) for a in absorptions]),
     )
+
+
+def surface_series(
+    system: OpticalSystem,
+    number: int,
+    wavelengths: Tensor,
+    sense: float = 1.0,
+    tolerance: float = 1e-12,
+) -> SurfaceSeries | None:
+    """Return the series of a coated surface; None where no series of 128 terms or fewer gives its
+    shares.
+
+    Args:
+        system: the lens.
+        number: of the surface, which has a coating.
+        wavelengths: (W,), nm.
+        sense: as of `losses_of`, as the last argument.
+        tolerance: of the shares.
+    """
+    waves = wavelengths.detach().double().reshape(-1, 1)
+    surface, mirror = system.surfaces[number - 1], number in system.mirrors
+    coating, places = surface.coating, (number - 1, number)
+    assert coating is not None  # as the argument says
+    if sense < 0.0 and not mirror:
+        coating, places = coating.turned_round(), places[::-1]
+    mode = (mirror, surface.deflection is not None, tolerance)
+    varies = torch.is_grad_enabled() and any(n.requires_grad for n in coating.tensors)
+    if system.index_offsets or varies:
+        of_media = system.indices(waves)
+        front, behind = (
+            torch.as_tensor(of_media[place], dtype=torch.float64).expand(waves.shape)
+            for place in places
+        )
+        return _computed_series(coating, front, behind, waves, *mode)
+    front_medium, behind_medium = (system.materials[place] for place in places)
+    numbers = tuple(map(float, waves[:, 0].tolist()))
+    values = tuple(float(value.detach()) for value in coating.tensors)
+    one = _series_of_numbers(coating.structure, values, front_medium, behind_medium, numbers, *mode)
+    return one and SurfaceSeries(*(_beside(part, waves) for part in one))
+
+
+def _beside(part: Tensor | Cosine, like: Tensor) -> Any:
+    return part.to(like.device) if isinstance(part, Tensor) else part
+
+
+@cached_tensors(maxsize=4096)
+def _series_of_numbers(
+    structure: CoatingState,
+    values: tuple[float, ...],
+    front: Medium,
+    behind: Medium,
+    wavelengths: tuple[float, ...],
+    mirror: bool,
+    deflects: bool,
+    tolerance: float,
+) -> SurfaceSeries | None:
+    """Return the series of a coating of these numbers, which many ghost paths share."""
+    waves = torch.tensor(wavelengths, dtype=torch.float64)[:, None]
+    coating = structure.with_tensors([torch.tensor(v, dtype=torch.float64) for v in values])
+    before, after = (
+        torch.as_tensor(medium.index(waves), dtype=torch.float64).expand(waves.shape)
+        for medium in (front, behind)
+    )
+    return _computed_series(coating, before, after, waves, mirror, deflects, tolerance)
+
+
+def _computed_series(
+    coating: CoatingState,
+    front: Tensor,
+    behind: Tensor,
+    waves: Tensor,
+    mirror: bool,
+    deflects: bool,
+    tolerance: float,
+) -> SurfaceSeries | None:
+    """Return the series of what a coating passes from front to behind, or reflects; indices and
+    wavelengths (W, 1).
+    """
+    ratio = front / (coating.behind(behind, waves) if mirror else behind)
+    thinner = not ratio.is_complex() and bool((ratio > 1.0).all()) and not deflects
+    cosine = Cosine.ARRIVING
+    if thinner:
+        cosine = Cosine.BEYOND if mirror else Cosine.LEAVING
+    for terms in _TERMS:
+        u = nodes(terms).to(waves).expand(len(waves), terms)
+        if thinner:
+            u = (1.0 - (1.0 - u.square()) / ratio.square()).sqrt()
+        r_s, r_p, t_s, t_p = coating.shares(front, behind, u, waves)
+        coefficients = series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p))
+        if float(coefficients[:, -_LAST:].detach().abs().max()) <= tolerance:
+            beyond = ratio if cosine == Cosine.BEYOND else torch.ones_like(waves)
+            return SurfaceSeries(coefficients, cosine, beyond)
+    return None
 
 
 def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) -> LossTable:

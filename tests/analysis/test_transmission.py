@@ -8,6 +8,7 @@ import torch
 import dolens
 from dolens import InputError
 from dolens.analysis.conditions import conditions
+from dolens.analysis.pupil_quadrature import uniform_pupil_points
 from dolens.analysis.transmission import transmission
 from dolens.optics.glass_catalog import glass_folders
 from dolens.prescriptions.build import lens_from_prescription
@@ -76,6 +77,17 @@ def test_absorbing_glass_is_told_from_surfaces(tmp_path):
     assert found.media[0, 0].tolist() == pytest.approx([1.0, 0.8**0.5, 1.0], rel=1e-12)
     assert found.share[0].tolist() == pytest.approx([0.8**0.5, 1.0], rel=1e-12)
     assert found.unknown == ("OWN:GREY",)  # at 1000 nm
+
+
+def test_the_mean_is_over_the_beam_and_not_over_what_is_left_of_it(bare):
+    """Of a coating that passes all at 0° and nothing at 60°, in collimated light on a sphere."""
+    steep = {"table": [[nm, a, 0, 0, 1 - a / 60, 1 - a / 60] for nm in (400, 700) for a in (0, 60)]}
+    lens = bare.coated("ideal").coated({1: steep})
+    pupil, weight = uniform_pupil_points(4000)
+    height = lens.aim((0.0, 0.0), pupil, 587.5618).position[:, :2].norm(dim=-1)
+    share = 1.0 - torch.rad2deg(torch.asin(height / 22.01359)) / 60.0
+    known = float((weight * share).sum())
+    assert float(lens.transmission(0.0, 587.5618).share) == pytest.approx(known, abs=1e-4)
 
 
 def test_what_passes_is_differentiable(bare):
