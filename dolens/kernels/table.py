@@ -170,23 +170,25 @@ class LossTable:
         numbers: float64, contiguous: the absorption (media, wavelengths), 1/mm, with the rows of
             `SurfaceTable.indices`; of S steps the ratios (S, wavelengths), of the index in front to
             that beyond; 2/(1 - lowest cosine u_0) of each, s (S,); the coefficients (S,
-            wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 4; then the same series
-            again, and its derivative with respect to u, as the kernels sum them: up to `POWERS` as
-            powers of x, and more as T_k.
+            wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 8; then the same series
+            again, and its derivative with respect to u, as the kernels sum them.
         steps: (steps, 2), int64, on the CPU: which of the S, in their order, a step has, or -1;
             and a `Cosine`.
         series: S.
         absorbs: whether any medium does.
+        powers: whether the kernels sum powers of x, which is faster, or T_k.
     """
 
     numbers: Tensor
     steps: Tensor
     series: int
     absorbs: bool
+    powers: bool
 
 
-# A series of more coefficients is not summed by powers, which would lose single precision's digits.
-POWERS = 16
+# Powers of x are not summed where their coefficients' sizes exceed this together: digits would be
+# lost, where those of T_k are not.
+POWERS = 8.0
 
 # Outputs that can be differentiated, and where they lie among the numbers that the kernels keep of
 # a ray, and so where their cotangents are one.

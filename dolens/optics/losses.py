@@ -17,6 +17,7 @@ from torch.nn.functional import pad
 
 from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
+from dolens.kernels.operators import are_plain
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
 from dolens.optics.coatings import CoatingState
 from dolens.optics.materials import Medium
@@ -26,7 +27,7 @@ from dolens.optics.system import OpticalSystem
 
 # Steps that are no surfaces of the lens; a law deflects what its surface has passed.
 _BETWEEN = (Kind.CHANGE_AXES, Kind.LENS_AXES, Kind.SENSOR, Kind.DEFLECT)
-_GROUP = 4  # coefficients that a kernel takes at once
+_GROUP = 8  # coefficients that a kernel takes at once
 # Lengths of series that are tried, and how many of the last coefficients must be small.
 _TERMS, _LAST = (8, 12, 16, 24, 32, 48, 64, 96, 128), 3
 
@@ -278,11 +279,20 @@ def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) 
     scales = 2.0 / (1.0 - lowest[order])
     terms, summed = coefficients.shape[-1], coefficients.detach()
     slopes = scales[:, None, None] * (summed @ _derivative(terms))
-    if terms <= POWERS:
-        summed, slopes = summed @ _powers(terms), slopes @ _powers(terms)
+    powers = summed @ _powers(terms)
+    by_powers = _is_small(powers)
+    if by_powers:
+        summed, slopes = powers, slopes @ _powers(terms)
     parts = (of_media, ratios.double()[order], scales, coefficients, summed, slopes)
     numbers = torch.cat([part.reshape(-1) for part in parts])
-    return LossTable(numbers, steps, len(order), absorption is not None)
+    return LossTable(numbers, steps, len(order), absorption is not None, by_powers)
+
+
+def _is_small(powers: Tensor) -> bool:
+    """Return whether sums of powers of x lose no digits: those of series that converge fast."""
+    if torch.compiler.is_compiling() or not are_plain((powers,)):
+        return False
+    return bool((powers.abs().sum(-1) < POWERS).all())
 
 
 @cached_tensors(maxsize=256)

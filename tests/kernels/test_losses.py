@@ -30,6 +30,8 @@ def drawn(lens, wavelengths=1, terms=8, lowest=0.0):
     numbers = system.met
     shape = (len(numbers), wavelengths)
     coefficients = 0.1 * torch.randn(*shape, terms, generator=generator, dtype=F64)
+    # Those that converge are summed by powers, and others, here of many terms, are not.
+    coefficients *= (0.4 if terms <= 16 else 1.0) ** torch.arange(terms)
     coefficients[..., 0] += 0.8
     kinds = (Cosine.LEAVING, Cosine.ARRIVING, Cosine.BEYOND)
     cosines = tuple(

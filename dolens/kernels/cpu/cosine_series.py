@@ -17,18 +17,23 @@ from dolens.kernels.cpu.layout import (
     CODE_ROW,
     CONIC,
     COSINE,
+    FACTORS,
     KIND,
     LOSS,
     OFFSET,
+    ROWS_OF_A_SERIES,
     SAG_AND_SLOPES,
     SENSE,
     SENSE_BEHIND,
     SHAPE,
+    SHARES,
     SHORT_RECORD,
     SLOPE_X,
     SLOPE_Y,
+    SLOPES,
     SPHERE,
     STATE,
+    SUM,
     UNBOUNDED,
     WORK_SIZE,
     L,
@@ -39,10 +44,11 @@ from dolens.kernels.cpu.layout import (
     Z,
 )
 from dolens.kernels.cpu.translation import scalar
-from dolens.kernels.table import POWERS, TINY, Cosine
+from dolens.kernels.table import TINY, Cosine
 
 # A call between functions takes as long as a loop over a block; what is rare is not inlined.
 INLINED = {**OPTIONS, "forceinline": True}
+NEXT = ROWS_OF_A_SERIES * BLOCK  # from the rows of a series to those of the next
 LEAVING, BEYOND = int(Cosine.LEAVING), int(Cosine.BEYOND)
 
 
@@ -58,7 +64,8 @@ class CosineSeries(NamedTuple):
         set_ratios: each ray's ratio of indices.
         set_cosine: cosines and arguments.
         set_argument: arguments from cosines.
-        sum_series: the series, or its slope.
+        multiply: the shares by a step's series.
+        keep: a step's series, its slope, and the shares behind it.
     """
 
     codes_of: Any
@@ -69,7 +76,8 @@ class CosineSeries(NamedTuple):
     set_ratios: Any
     set_cosine: Any
     set_argument: Any
-    sum_series: Any
+    multiply: Any
+    keep: Any
 
 
 @cache
@@ -188,20 +196,66 @@ def cosine_series(real: types.Type) -> CosineSeries:
         return job[jobs.COEFFICIENTS] + series * job[jobs.TERMS]
 
     @njit(**INLINED)
-    def sum_powers(job, first, x_, sum_):  # noqa: ANN001, ANN202
-        """Fill a row with a polynomial by Horner's rule, four terms at once."""
-        x, b = carray(x_, BLOCK), carray(sum_, BLOCK)
-        last = first + job[jobs.TERMS] - 4
-        c = numbers_at(job, last)
-        c3, c2, c1, c0 = real(c[3]), real(c[2]), real(c[1]), real(c[0])
+    def eight_at(job, place):  # noqa: ANN001, ANN202
+        c = numbers_at(job, place)
+        upper = real(c[7]), real(c[6]), real(c[5]), real(c[4])
+        return upper, (real(c[3]), real(c[2]), real(c[1]), real(c[0]))
+
+    @njit(**INLINED)
+    def four_more(c, x, b):  # noqa: ANN001, ANN202
+        """Go on with Horner's rule by four coefficients."""
+        return (((b * x + c[0]) * x + c[1]) * x + c[2]) * x + c[3]
+
+    @njit(**INLINED)
+    def four_slopes(c, x, b, d):  # noqa: ANN001, ANN202
+        """Go on with value and slope by four coefficients."""
+        d = d * x + b
+        b = b * x + c[0]
+        d = d * x + b
+        b = b * x + c[1]
+        d = d * x + b
+        b = b * x + c[2]
+        return b * x + c[3], d * x + b
+
+    @njit(**INLINED)
+    def multiply_by_powers(job, first, rows):  # noqa: ANN001, ANN202
+        """Multiply the row of shares by a polynomial, by Horner's rule."""
+        x, b = carray(shifted(rows, ARGUMENT), BLOCK), carray(shifted(rows, SUM), BLOCK)
+        share, last = carray(shifted(rows, SHARES), BLOCK), first + job[jobs.TERMS] - 8
         for i in range(BLOCK):
-            b[i] = ((c3 * x[i] + c2) * x[i] + c1) * x[i] + c0
+            b[i] = zero
         while last > first:
-            last -= 4
-            c = numbers_at(job, last)
-            c3, c2, c1, c0 = real(c[3]), real(c[2]), real(c[1]), real(c[0])
+            upper, lower = eight_at(job, last)
             for i in range(BLOCK):
-                b[i] = (((b[i] * x[i] + c3) * x[i] + c2) * x[i] + c1) * x[i] + c0
+                b[i] = four_more(lower, x[i], four_more(upper, x[i], b[i]))
+            last -= 8
+        upper, lower = eight_at(job, first)
+        for i in range(BLOCK):
+            share[i] *= four_more(lower, x[i], four_more(upper, x[i], b[i]))
+
+    @njit(**INLINED)
+    def keep_powers(job, first, scale, rows, own):  # noqa: ANN001, ANN202
+        """Fill the rows of a polynomial, of its slope with respect to the cosine, and of the share
+        that is left behind it.
+        """
+        x, b = carray(shifted(rows, ARGUMENT), BLOCK), carray(shifted(rows, SUM), BLOCK)
+        d, last = carray(shifted(rows, BEFORE_SUM), BLOCK), first + job[jobs.TERMS] - 8
+        s = carray(own, UNBOUNDED)
+        for i in range(BLOCK):
+            b[i], d[i] = zero, zero
+        while last > first:
+            upper, lower = eight_at(job, last)
+            for i in range(BLOCK):
+                b0, d0 = four_slopes(upper, x[i], b[i], d[i])
+                b[i], d[i] = four_slopes(lower, x[i], b0, d0)
+            last -= 8
+        upper, lower = eight_at(job, first)
+        for i in range(BLOCK):
+            b0, d0 = four_slopes(upper, x[i], b[i], d[i])
+            b0, d0 = four_slopes(lower, x[i], b0, d0)
+            # Below the lowest cosine the share is the same.
+            s[SLOPES + i] = scale * d0 if x[i] > -one else zero
+            s[FACTORS + i], s[SHARES + NEXT + i] = b0, s[SHARES + i] * b0
 
     @njit(**OPTIONS)
     def sum_chebyshev(job, first, x_, sum_, before_):  # noqa: ANN001, ANN202
@@ -226,7 +280,7 @@ def cosine_series(real: types.Type) -> CosineSeries:
         """Fill a row with either, of rays of several wavelengths."""
         x, b, e = carray(x_, BLOCK), carray(sum_, BLOCK), carray(before_, BLOCK)
         which, terms = carray(int32_at(job[jobs.WHICH]), UNBOUNDED), job[jobs.TERMS]
-        powers = terms <= POWERS
+        powers = job[jobs.BY_POWERS] != 0
         for i in range(BLOCK):
             b[i], e[i] = zero, zero
         for j in range(terms - 1, -1, -1):
@@ -242,18 +296,48 @@ def cosine_series(real: types.Type) -> CosineSeries:
             b[i] -= x[i] * e[i]
 
     @njit(**INLINED)
-    def sum_series(job, codes, part, lanes, rows, sum_):  # noqa: ANN001, ANN202
-        """Fill a row with the series at its arguments (part 1) or its slope (part 2)."""
-        x, before = shifted(rows, ARGUMENT), shifted(rows, BEFORE_SUM)
+    def place_of(job, codes, part):  # noqa: ANN001, ANN202
+        """Return where a step's coefficients begin as they are summed (part 1), or those of its
+        slope (part 2): of the rays' wavelength, or of the first where they differ.
+        """
         all_ = job[jobs.SERIES] * job[jobs.WAVELENGTHS] * job[jobs.TERMS]
-        first = coefficients_at(job, codes) + part * all_
         common = job[jobs.WAVELENGTH] - 1
-        if common < 0:
-            sum_mixed(job, first, lanes, x, sum_, before)
-        elif job[jobs.TERMS] <= POWERS:
-            sum_powers(job, first + common * job[jobs.TERMS], x, sum_)
+        first = coefficients_at(job, codes) + part * all_
+        return first + (common if common > 0 else 0) * job[jobs.TERMS]
+
+    @njit(**OPTIONS)
+    def sum_other(job, codes, part, lanes, rows, sum_):  # noqa: ANN001, ANN202
+        """Fill a row with a series of many terms, or of several wavelengths."""
+        x, before = shifted(rows, ARGUMENT), shifted(rows, BEFORE_SUM)
+        if job[jobs.WAVELENGTH] == 0:
+            sum_mixed(job, place_of(job, codes, part), lanes, x, sum_, before)
         else:
-            sum_chebyshev(job, first + common * job[jobs.TERMS], x, sum_, before)
+            sum_chebyshev(job, place_of(job, codes, part), x, sum_, before)
+
+    @njit(**INLINED)
+    def multiply(job, codes, lanes, rows):  # noqa: ANN001, ANN202
+        """Multiply the row of shares by a step's series."""
+        if job[jobs.WAVELENGTH] > 0 and job[jobs.BY_POWERS] != 0:
+            multiply_by_powers(job, place_of(job, codes, 1), rows)
+            return
+        sum_other(job, codes, 1, lanes, rows, shifted(rows, SUM))
+        r = carray(rows, UNBOUNDED)
+        for i in range(BLOCK):
+            r[SHARES + i] *= r[SUM + i]
+
+    @njit(**INLINED)
+    def keep(job, codes, lanes, rows, own):  # noqa: ANN001, ANN202
+        """Fill the rows of a step's series, of its slope, and of the share behind it."""
+        if job[jobs.WAVELENGTH] > 0 and job[jobs.BY_POWERS] != 0:
+            keep_powers(job, place_of(job, codes, 1), scale_of(job, codes), rows, own)
+            return
+        sum_other(job, codes, 1, lanes, rows, shifted(own, FACTORS))
+        sum_other(job, codes, 2, lanes, rows, shifted(own, SLOPES))
+        x, s = carray(shifted(rows, ARGUMENT), BLOCK), carray(own, UNBOUNDED)
+        for i in range(BLOCK):
+            slope = s[SLOPES + i]
+            s[SLOPES + i] = slope if x[i] > -one else zero
+            s[SHARES + NEXT + i] = s[SHARES + i] * s[FACTORS + i]
 
     return CosineSeries(
         codes_of,
@@ -264,5 +348,6 @@ def cosine_series(real: types.Type) -> CosineSeries:
         set_ratios,
         set_cosine,
         set_argument,
-        sum_series,
+        multiply,
+        keep,
     )

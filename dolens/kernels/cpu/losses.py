@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.compiler import OPTIONS, int32_at, real64_at, shifted
-from dolens.kernels.cpu.cosine_series import BEYOND, INLINED, LEAVING, cosine_series
+from dolens.kernels.cpu.cosine_series import BEYOND, INLINED, LEAVING, NEXT, cosine_series
 from dolens.kernels.cpu.forward import forward_driver, real_at, streams
 from dolens.kernels.cpu.layout import (
     ARGUMENT,
@@ -40,7 +40,6 @@ from dolens.kernels.cpu.layout import (
     OF_SHARE,
     OFFSET,
     PATH,
-    ROWS_OF_A_SERIES,
     SENSE,
     SENSE_BEHIND,
     SHARES,
@@ -53,8 +52,6 @@ from dolens.kernels.cpu.layout import (
     WEIGHT,
     WORK_SIZE,
 )
-
-_NEXT = ROWS_OF_A_SERIES * BLOCK  # from the rows of a series to those of the next
 
 
 class PassedLight(NamedTuple):
@@ -128,7 +125,7 @@ def passed_light(real: types.Type) -> PassedLight:
     at = real_at(real)
     step, exponential = streams(real).step, _exponential(real)
     codes_of, numbers_at, coefficients_at, scale_of, *others = cosine_series(real)
-    set_by_wavelength, set_ratios, set_cosine, set_argument, sum_series = others
+    set_by_wavelength, set_ratios, set_cosine, set_argument, multiply, keep_series = others
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @njit(**INLINED)
@@ -140,7 +137,7 @@ def passed_light(real: types.Type) -> PassedLight:
         place = codes[BEFORE] * job[jobs.WAVELENGTHS] + common
         return common >= 0 and numbers_at(job, place)[0] == types.float64(0.0)
 
-    @njit(**OPTIONS)
+    @njit(**INLINED)
     def begin(job):  # noqa: ANN001, ANN202
         rows = carray(at(job[jobs.DRIVER_ROWS]), UNBOUNDED)
         for i in range(BLOCK):
@@ -169,10 +166,7 @@ def passed_light(real: types.Type) -> PassedLight:
             return
         cosine, x = shifted(rows, COSINES), shifted(rows, ARGUMENT)
         set_cosine(job, codes, lanes, before, after, cosine, x)
-        sum_series(job, codes, 1, lanes, rows, shifted(rows, FACTORS))
-        r = carray(rows, UNBOUNDED)
-        for i in range(BLOCK):
-            r[SHARES + i] *= r[FACTORS + i]
+        multiply(job, codes, lanes, rows)
 
     @njit(**INLINED)
     def store_share(job, start, count):  # noqa: ANN001, ANN202
@@ -182,21 +176,6 @@ def passed_light(real: types.Type) -> PassedLight:
             out[i] = rows[SHARES + i] * exponential(rows[DEPTH + i])
 
     @njit(**INLINED)
-    def keep_series(job, codes, lanes, before, after, rows):  # noqa: ANN001, ANN202
-        """Fill the rows of a step's series, and that of the share in front of the next."""
-        own = shifted(rows, _NEXT * (codes[LOSS] - 1))
-        cosine, x = shifted(own, COSINES), shifted(rows, ARGUMENT)
-        set_cosine(job, codes, lanes, before, after, cosine, x)
-        sum_series(job, codes, 1, lanes, rows, shifted(own, FACTORS))
-        sum_series(job, codes, 2, lanes, rows, shifted(own, SLOPES))
-        r, s = carray(rows, UNBOUNDED), carray(own, UNBOUNDED)
-        for i in range(BLOCK):
-            # Below the lowest cosine the share is the same.
-            slope = s[SLOPES + i]
-            s[SLOPES + i] = slope if r[ARGUMENT + i] > -one else zero
-            s[SHARES + _NEXT + i] = s[SHARES + i] * s[FACTORS + i]
-
-    @njit(**OPTIONS)
     def keep(job, lanes):  # noqa: ANN001, ANN202
         begin(job)
         stack, work, rows = at(job[jobs.STACK]), at(job[jobs.WORK]), at(job[jobs.DRIVER_ROWS])
@@ -207,12 +186,15 @@ def passed_light(real: types.Type) -> PassedLight:
             if not is_clear(job, codes):
                 absorb(job, codes, lanes, then, rows)
             if codes[LOSS] != 0:
-                keep_series(job, codes, lanes, now, then, rows)
+                own = shifted(rows, NEXT * (codes[LOSS] - 1))
+                cosine, x = shifted(own, COSINES), shifted(rows, ARGUMENT)
+                set_cosine(job, codes, lanes, now, then, cosine, x)
+                keep_series(job, codes, lanes, rows, own)
 
-    @njit(**OPTIONS)
+    @njit(**INLINED)
     def turn_round(job, lanes, count):  # noqa: ANN001, ANN202
         rows = carray(at(job[jobs.DRIVER_ROWS]), UNBOUNDED)
-        left = carray(shifted(at(job[jobs.DRIVER_ROWS]), SHARES + _NEXT * job[jobs.SERIES]), BLOCK)
+        left = carray(shifted(at(job[jobs.DRIVER_ROWS]), SHARES + NEXT * job[jobs.SERIES]), BLOCK)
         path = carray(shifted(at(job[jobs.COTANGENTS]), PATH), BLOCK)
         for i in range(BLOCK):
             rows[OF_SHARE + i], rows[OF_PATH + i] = zero, path[i]
@@ -292,7 +274,7 @@ def passed_light(real: types.Type) -> PassedLight:
     @njit(**INLINED)
     def pass_back(job, codes, lanes, rows, sums):  # noqa: ANN001, ANN202
         """Take the cotangents of the share back through a surface, and leave that of its cosine."""
-        own = shifted(rows, _NEXT * (codes[LOSS] - 1))
+        own = shifted(rows, NEXT * (codes[LOSS] - 1))
         r, s, w = (
             carray(rows, UNBOUNDED),
             carray(own, UNBOUNDED),
@@ -322,7 +304,7 @@ def passed_light(real: types.Type) -> PassedLight:
         """Return whether rays travel at a step, so that its adjoint takes a path's cotangent in."""
         return codes[KIND] != DEFLECT and codes[KIND] != LENS_AXES
 
-    @njit(**OPTIONS)
+    @njit(**INLINED)
     def prepare(job, k, lanes, sums):  # noqa: ANN001, ANN202
         """Where a medium absorbs, what t brings to the depth joins the cotangent of the path, n·t:
         by α/n of that of the depth.
@@ -357,7 +339,7 @@ def passed_light(real: types.Type) -> PassedLight:
                 more = r[SUM + i] / r[WEIGHT + i] * r[OF_DEPTH + i]
                 r[SUM + i], path[i] = more, r[OF_PATH + i] + more
 
-    @njit(**OPTIONS)
+    @njit(**INLINED)
     def finish(job, k):  # noqa: ANN001, ANN202
         """The path has its own cotangent again, and the index that of the path alone."""
         codes = codes_of(job, k)

@@ -312,6 +312,7 @@ class Program:
         terms = losses.numbers.numel() - coefficients
         terms //= max(3 * losses.series * wavelengths, 1)
         self._losses = losses  # held
+        self.job[jobs.BY_POWERS] = int(losses.powers)
         # Neighbours in a job.
         self.job[jobs.LOSSES : jobs.ABSORBS + 1] = (
             *(losses.numbers.data_ptr(), ratios, coefficients),
