@@ -11,7 +11,8 @@ from dolens.kernels.cpu import losses as kernels
 from dolens.kernels.table import Cosine
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.ghost_paths import ghost_path_systems, with_losses
-from dolens.optics.losses import Losses, losses_of, nodes, series
+from dolens.optics.losses import Losses, loss_table, losses_of, nodes, series
+from dolens.optics.packing import lay_out
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Unlimited
@@ -168,6 +169,8 @@ def test_series_of_any_length_from_any_cosine_on(terms, lowest, root):
     lens = LENSES["cooke_triplet"](root)
     lens.backend = "cpu"
     rays, losses = free(bundle(lens, 60)), drawn(lens, terms=terms, lowest=lowest)
+    found = lay_out(lens.system(), 1.0, 1, 6, True)
+    assert loss_table(losses, found, 1, 6).powers == (terms <= 16)
     hit = trace_rays(lens.system(), rays, losses=losses)
     expected = expected_share(lens, rays, losses)
     assert (hit.transmission - expected)[hit.valid].abs().max() < 1e-12
