@@ -2,9 +2,10 @@
 
 A Jones matrix needs two axes across the ray in front of the lens and behind it.  They are
 Chipman's double-pole axes about the mean direction of the light on either side (see
-`dolens.optics.polarisation.double_pole_axes`), in which a polariser far from the pupil, or a
-sensor, sees a converging beam with the least turn.  For small angles the x and y components of the
-field itself will do: `cartesian`.
+`dolens.optics.polarisation.double_pole_axes`; behind the lens they start from the sensor's x and
+y, which coordinate breaks may turn), in which a polariser far from the pupil, or a sensor, sees a
+converging beam with the least turn.  For small angles the x and y components of the field itself
+will do: `cartesian`.
 
 Of the lens's own diattenuation and retardance the turn of the axes by geometry alone is taken off:
 that by the same lens with ideal surfaces, along the same rays.
@@ -56,8 +57,8 @@ class JonesPupils(AtConditions):
             double-pole axes on both sides.
         own: (F, W, S, S, 2, 2), of the lens alone, behind it in the axes that geometry carries
             there from those in front.
-        cartesian: (F, W, S, S, 2, 2), of the lens alone: x and y of the field behind it, over those
-            in front.
+        cartesian: (F, W, S, S, 2, 2), of the lens alone: x and y of the field behind it, in the
+            sensor's axes, over those in front.
         scalar: (F, W), the mean of the trace's `transmission`, which multiplies means over s and p
             of each surface.
     """
@@ -154,7 +155,7 @@ def jones_pupils(
     light = (wavefront.amplitude * wavefront.weight).where(stop.isfinite().all(-1), 0.0)
     light = (light / light.sum((-2, -1), keepdim=True)).nan_to_num(0.0)
 
-    lit, _, rays, traced, axes = polarised_pupil(system, points, wave, beam, light)
+    lit, rays, traced, axes, sensor = polarised_pupil(system, points, wave, beam, light)
     # Behind ideal surfaces the axes in front are where geometry carries them.
     turn = (traced.front[..., :2].mT @ axes[0]).to(traced.jones)
     scalar = trace_rays(system.opened(), rays, transmission=True).transmission
@@ -175,7 +176,7 @@ def jones_pupils(
         found(lit & (wavefront.coverage >= 0.5)),
         over_pupil(traced.in_axes(*axes)),
         over_pupil(turn.mT @ traced.jones @ turn),
-        over_pupil(traced.matrix[..., :2, :2]),
+        over_pupil((sensor.mT.to(turn) @ traced.matrix)[..., :2, :2]),
         (over_pupil(scalar) * found(light)).sum((-2, -1)),
     )
     return pupils.between(front, behind)
@@ -186,17 +187,17 @@ class PolarisedPupil(NamedTuple):
 
     Attributes:
         lit: (N, S, S), bool: they.
-        owner: (M,): number of the pupil.
         rays: in front of the lens.
         traced: behind it.
         axes: (M, 3, 2) in front and behind: double-pole axes about the mean direction there.
+        sensor: (3, 3), columns: the sensor's axes in the lens's.
     """
 
     lit: Tensor
-    owner: Tensor
     rays: Rays
     traced: PolarisedRays
     axes: tuple[Tensor, Tensor]
+    sensor: Tensor
 
 
 def polarised_pupil(
@@ -219,11 +220,13 @@ def polarised_pupil(
     owner = torch.nonzero(lit)[:, 0]
     rays = Rays.from_components(Components(*(c[lit] for c in ray)), wave[owner])
     traced = trace_polarised(system.opened(), rays)
+    # Behind coordinate breaks the sensor has axes of its own.
+    sensor = system.all_axes[-1].place(system.device)[0]
     front, behind = (
         double_pole_axes(way, _mean_directions(way, light[lit], owner, len(points))[owner])
-        for way in (traced.front[..., 2], traced.behind[..., 2])
+        for way in (traced.front[..., 2], traced.behind[..., 2] @ sensor)
     )
-    return PolarisedPupil(lit, owner, rays, traced, (front, behind))
+    return PolarisedPupil(lit, rays, traced, (front, sensor @ behind), sensor)
 
 
 def _mean_directions(direction: Tensor, light: Tensor, owner: Tensor, count: int) -> Tensor:

@@ -43,9 +43,9 @@ class VectorPointSpread(AtConditions):
     Attributes:
         centre: (F, 2), mm on the sensor, of the windows: the centroids of the light.
         half_width_um: (F,), µm, from the centre to the sides of the window.
-        parts: (F, 3, M, M), |E_x|², |E_y|² and |E_z|² in the lens's axes, at the centres of cells,
-            per µm² with the light that apertures pass as unit; rows run along +y and columns along
-            +x.  NaN where no light passes.
+        parts: (F, 3, M, M), |E_x|², |E_y|² and |E_z|² in the sensor's axes, at the centres of
+            cells, per µm² with the light that apertures pass as unit; rows run along +y and columns
+            along +x.  NaN where no light passes.
         scalar: (F, M, M), irradiance of the same rays whose fields are added up as numbers.
         sampling_error: (F,), largest change by a second sum over half of the rays, over the peak.
     """
@@ -160,7 +160,7 @@ def _added(
     traced, (ahead, _) = pupil.traced, pupil.axes
     entering = (traced.front[..., :2].mT @ ahead).to(states) @ states.to(traced.jones)
     across = traced.jones @ entering
-    vectors = traced.behind[..., :2].to(states) @ across
+    vectors = (pupil.sensor.mT @ traced.behind[..., :2]).to(states) @ across
     modulus = torch.view_as_real(across).square().sum((-1, -2, -3)).sqrt()
     columns = torch.cat([vectors.flatten(1), modulus[:, None].to(vectors)], 1)
     fields = columns.new_zeros(*flux.shape, columns.shape[1])

@@ -174,3 +174,30 @@ def test_a_lens_shows_its_polarisation():
     assert titles[3].startswith("crossed polarisers")
     with pytest.raises(InputError, match="behind: element 1"):
         lens.polarisation(fields=[20], behind=[{"mirror": 0}])
+
+
+def test_a_folded_lens_has_the_axes_of_its_sensor():
+    def lens(folded):
+        rows = {"1": {"radius": 30, "thickness": 4, "material": "1.6", "coating": "none"}}
+        rows["2"] = {"radius": -40, "material": "air", "coating": "none"}
+        if folded:
+            rows["2"]["thickness"] = 10.0
+            rows["3"] = {"type": "coordinate_break", "tilt_y": 45, "thickness": 0}
+            rows["4"] = {"type": "plane", "thickness": 0, "material": "mirror"}
+            rows["5"] = {"type": "coordinate_break", "tilt_y": 45, "thickness": -10}
+            rows["6"] = {"type": "plane", "material": "air"}
+        for row in rows.values():
+            if row.get("type") != "coordinate_break":
+                row.setdefault("semi_diameter", 8 if "radius" in row else 30)
+        sensor = {"distance": -10.0 if folded else 20.0}
+        given = {"surfaces": rows, "sensor": sensor, "stop": 1}
+        return lens_from_prescription(given).requires_grad_(False)
+
+    straight, folded = pupils(lens(False)), pupils(lens(True))
+    inside = straight.inside & folded.inside
+    assert int(inside.sum()) > 300
+    # The mirror's s is y here: E' = -H·E keeps x and turns y over, in axes along the light.
+    matrix = folded.jones[inside].abs() - straight.jones[inside].abs()
+    assert float(matrix.abs().max()) < 1e-12
+    assert float((folded.own[inside] - straight.own[inside]).abs().max()) < 1e-12
+    assert float((folded.stokes() - straight.stokes()).abs().max()) < 1e-12
