@@ -390,7 +390,7 @@ class ImageQualityViews:
             >>> bare = dolens.load_lens("cooke_triplet").coated("none")
             >>> coated = bare.coated("quarter_wave")
             >>> [round(float(x.transmission(0.0, 550).share), 3) for x in (bare, coated)]
-            [0.708, 0.961]
+            [0.706, 0.963]
 
         Args:
             fields: see the class, as the other arguments that are not named here.
