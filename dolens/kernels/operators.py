@@ -200,18 +200,17 @@ def trace_losses(
     steps: Tensor,
     series: int,
     absorbs: bool,
-    powers: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Carry rays that lose light through a `SurfaceTable`; see `trace`.
 
     Args:
-        numbers: of a `LossTable`, and `steps`, `series`, `absorbs` and `powers`.
+        numbers: of a `LossTable`, and `steps`, `series` and `absorbs`.
 
     Returns:
         What `trace` does, and the share of light that is left (N,).
     """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
-    losses = LossTable(numbers.contiguous(), steps, series, absorbs, powers)
+    losses = LossTable(numbers.contiguous(), steps, series, absorbs)
     return kernels_of(position).trace(table, position, direction, which, losses=losses)
 
 
@@ -233,7 +232,6 @@ def trace_losses_adjoint(
     steps: Tensor,
     series: int,
     absorbs: bool,
-    powers: bool,
     status: Tensor,
     of_position: Tensor | None,
     of_direction: Tensor | None,
@@ -246,7 +244,7 @@ def trace_losses_adjoint(
     `wanted`: of position, direction, indices and numbers; what is not comes back empty, or zero.
     """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
-    losses = LossTable(numbers.contiguous(), steps, series, absorbs, powers)
+    losses = LossTable(numbers.contiguous(), steps, series, absorbs)
     position_gradient, direction_gradient, sums = kernels_of(position).sweep(
         *(table, position, direction, which, status),
         (of_position, of_direction, of_path, of_share),
@@ -273,8 +271,8 @@ def _trace_losses_adjoint_shapes(values, indices, numbers, position, *others):  
 
 
 def _setup_losses(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *tensors, series, absorbs, powers = inputs
-    ctx.how = (series, absorbs, powers)
+    *tensors, series, absorbs = inputs
+    ctx.how = (series, absorbs)
     _setup(ctx, tuple(tensors), output)
 
 
@@ -282,7 +280,7 @@ def _backward_losses(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None
     *inputs, status = ctx.saved_tensors
     given = (*gradients[:3], gradients[5])
     if all(g is None for g in given):
-        return (None,) * 12
+        return (None,) * 11
     needs = ctx.needs_input_grad
     wanted = [needs[3], needs[4], needs[1], needs[2]]
     of_values, of_indices, of_numbers, of_position, of_direction = trace_losses_adjoint(
@@ -292,7 +290,7 @@ def _backward_losses(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None
         *(of_values, of_indices, of_numbers),
         of_position if wanted[0] else None,
         of_direction if wanted[1] else None,
-        *(None,) * 7,
+        *(None,) * 6,
     )
 
 

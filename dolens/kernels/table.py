@@ -172,18 +172,17 @@ class LossTable:
             that beyond; 2/(1 - lowest cosine u_0) of each, s (S,); the coefficients (S,
             wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 8; then the same series
             again, and its derivative with respect to u, as the kernels sum them.
-        steps: (steps, 2), int64, on the CPU: which of the S, in their order, a step has, or -1;
-            and a `Cosine`.
+        steps: (steps, 3), int64, on the CPU: which of the S, in their order, a step has, or -1; a
+            `Cosine`; and how many of the K terms are summed, a multiple of 8: as powers of x, which
+            is faster, or, where it is negative, as T_k.
         series: S.
         absorbs: whether any medium does.
-        powers: whether the kernels sum powers of x, which is faster, or T_k.
     """
 
     numbers: Tensor
     steps: Tensor
     series: int
     absorbs: bool
-    powers: bool
 
 
 # Powers of x are not summed where their coefficients' sizes exceed this together: digits would be

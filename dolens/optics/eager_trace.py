@@ -78,7 +78,7 @@ def trace_by_operator(
         return operators.trace(values, indices, position, direction, which, codes, extras)
     return operators.trace_losses(
         *(values, indices, losses.numbers, position, direction, which, codes, extras),
-        *(losses.steps, losses.series, losses.absorbs, losses.powers),
+        *(losses.steps, losses.series, losses.absorbs),
     )
 
 
@@ -143,7 +143,7 @@ class _Trace(torch.autograd.Function):
                 of_values, of_indices, of_losses, of_position, of_direction = (
                     operators.trace_losses_adjoint(
                         *(packed, indices, of_losses, *traced),
-                        *(losses.steps, losses.series, losses.absorbs, losses.powers),
+                        *(losses.steps, losses.series, losses.absorbs),
                         *(status, *cotangents, [*wanted, needs[3]]),
                     )
                 )

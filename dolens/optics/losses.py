@@ -17,7 +17,6 @@ from torch.nn.functional import pad
 
 from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
-from dolens.kernels.operators import are_plain
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
 from dolens.optics.coatings import CoatingState
 from dolens.optics.materials import Medium
@@ -280,19 +279,26 @@ def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) 
     terms, summed = coefficients.shape[-1], coefficients.detach()
     slopes = scales[:, None, None] * (summed @ _derivative(terms))
     powers = summed @ _powers(terms)
-    by_powers = _is_small(powers)
-    if by_powers:
-        summed, slopes = powers, slopes @ _powers(terms)
+    counts, small = _summed(summed, powers)
+    by_powers = small[:, None, None]
+    summed = torch.where(by_powers, powers, summed)
+    slopes = torch.where(by_powers, slopes @ _powers(terms), slopes)
+    of_steps = counts[steps[:, 0]] if len(order) else steps[:, 0]
+    steps = torch.cat((steps, of_steps[:, None]), 1)
     parts = (of_media, ratios.double()[order], scales, coefficients, summed, slopes)
     numbers = torch.cat([part.reshape(-1) for part in parts])
-    return LossTable(numbers, steps, len(order), absorption is not None, by_powers)
+    return LossTable(numbers, steps, len(order), absorption is not None)
 
 
-def _is_small(powers: Tensor) -> bool:
-    """Return whether sums of powers of x lose no digits: those of series that converge fast."""
-    if torch.compiler.is_compiling() or not are_plain((powers,)):
-        return False
-    return bool((powers.abs().sum(-1) < POWERS).all())
+def _summed(coefficients: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:
+    """Return of each series (S, W, K) how many terms are summed, (S,), negative of T_k; and
+    whether they are powers of x, (S,): those of series that converge fast lose no digits.
+    """
+    small = (powers.abs().sum(-1) < POWERS).all(-1)
+    place = torch.arange(1, coefficients.shape[-1] + 1)
+    last = torch.where(coefficients != 0.0, place, 1).amax((1, 2))
+    count = (last + _GROUP - 1) // _GROUP * _GROUP
+    return torch.where(small, count, -count), small
 
 
 @cached_tensors(maxsize=256)

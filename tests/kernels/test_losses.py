@@ -170,7 +170,7 @@ def test_series_of_any_length_from_any_cosine_on(terms, lowest, root):
     lens.backend = "cpu"
     rays, losses = free(bundle(lens, 60)), drawn(lens, terms=terms, lowest=lowest)
     found = lay_out(lens.system(), 1.0, 1, 6, True)
-    assert loss_table(losses, found, 1, 6).powers == (terms <= 16)
+    assert bool((loss_table(losses, found, 1, 6).steps[:6, 2] > 0).all()) == (terms <= 16)
     hit = trace_rays(lens.system(), rays, losses=losses)
     expected = expected_share(lens, rays, losses)
     assert (hit.transmission - expected)[hit.valid].abs().max() < 1e-12

@@ -34,6 +34,7 @@ from dolens.kernels.cpu.layout import (
     SPHERE,
     STATE,
     SUM,
+    SUMMED,
     UNBOUNDED,
     WORK_SIZE,
     L,
@@ -218,10 +219,10 @@ def cosine_series(real: types.Type) -> CosineSeries:
         return b * x + c[3], d * x + b
 
     @njit(**INLINED)
-    def multiply_by_powers(job, first, rows):  # noqa: ANN001, ANN202
+    def multiply_by_powers(job, first, terms, rows):  # noqa: ANN001, ANN202
         """Multiply the row of shares by a polynomial, by Horner's rule."""
         x, b = carray(shifted(rows, ARGUMENT), BLOCK), carray(shifted(rows, SUM), BLOCK)
-        share, last = carray(shifted(rows, SHARES), BLOCK), first + job[jobs.TERMS] - 8
+        share, last = carray(shifted(rows, SHARES), BLOCK), first + terms - 8
         for i in range(BLOCK):
             b[i] = zero
         while last > first:
@@ -234,12 +235,12 @@ def cosine_series(real: types.Type) -> CosineSeries:
             share[i] *= four_more(lower, x[i], four_more(upper, x[i], b[i]))
 
     @njit(**INLINED)
-    def keep_powers(job, first, scale, rows, own):  # noqa: ANN001, ANN202
+    def keep_powers(job, first, terms, scale, rows, own):  # noqa: ANN001, ANN202
         """Fill the rows of a polynomial, of its slope with respect to the cosine, and of the share
         that is left behind it.
         """
         x, b = carray(shifted(rows, ARGUMENT), BLOCK), carray(shifted(rows, SUM), BLOCK)
-        d, last = carray(shifted(rows, BEFORE_SUM), BLOCK), first + job[jobs.TERMS] - 8
+        d, last = carray(shifted(rows, BEFORE_SUM), BLOCK), first + terms - 8
         s = carray(own, UNBOUNDED)
         for i in range(BLOCK):
             b[i], d[i] = zero, zero
@@ -258,12 +259,12 @@ def cosine_series(real: types.Type) -> CosineSeries:
             s[FACTORS + i], s[SHARES + NEXT + i] = b0, s[SHARES + i] * b0
 
     @njit(**OPTIONS)
-    def sum_chebyshev(job, first, x_, sum_, before_):  # noqa: ANN001, ANN202
+    def sum_chebyshev(job, first, terms, x_, sum_, before_):  # noqa: ANN001, ANN202
         """Fill a row with a series by Clenshaw's sums b_k = c_k + 2x·b_(k+1) - b_(k+2)."""
         x, b, e = carray(x_, BLOCK), carray(sum_, BLOCK), carray(before_, BLOCK)
         for i in range(BLOCK):
             b[i], e[i] = zero, zero
-        for j in range(job[jobs.TERMS] - 4, -1, -4):
+        for j in range(terms - 4, -1, -4):
             c = numbers_at(job, first + j)
             c3, c2, c1, c0 = real(c[3]), real(c[2]), real(c[1]), real(c[0])
             for i in range(BLOCK):
@@ -276,14 +277,14 @@ def cosine_series(real: types.Type) -> CosineSeries:
             b[i] -= x[i] * e[i]
 
     @njit(**OPTIONS)
-    def sum_mixed(job, first, lanes, x_, sum_, before_):  # noqa: ANN001, ANN202
+    def sum_mixed(job, first, summed, lanes, x_, sum_, before_):  # noqa: ANN001, ANN202
         """Fill a row with either, of rays of several wavelengths."""
         x, b, e = carray(x_, BLOCK), carray(sum_, BLOCK), carray(before_, BLOCK)
         which, terms = carray(int32_at(job[jobs.WHICH]), UNBOUNDED), job[jobs.TERMS]
-        powers = job[jobs.BY_POWERS] != 0
+        powers = summed > 0
         for i in range(BLOCK):
             b[i], e[i] = zero, zero
-        for j in range(terms - 1, -1, -1):
+        for j in range(abs(summed) - 1, -1, -1):
             c = numbers_at(job, first + j)
             if powers:
                 for i in range(BLOCK):
@@ -310,15 +311,15 @@ def cosine_series(real: types.Type) -> CosineSeries:
         """Fill a row with a series of many terms, or of several wavelengths."""
         x, before = shifted(rows, ARGUMENT), shifted(rows, BEFORE_SUM)
         if job[jobs.WAVELENGTH] == 0:
-            sum_mixed(job, place_of(job, codes, part), lanes, x, sum_, before)
+            sum_mixed(job, place_of(job, codes, part), codes[SUMMED], lanes, x, sum_, before)
         else:
-            sum_chebyshev(job, place_of(job, codes, part), x, sum_, before)
+            sum_chebyshev(job, place_of(job, codes, part), -codes[SUMMED], x, sum_, before)
 
     @njit(**INLINED)
     def multiply(job, codes, lanes, rows):  # noqa: ANN001, ANN202
         """Multiply the row of shares by a step's series."""
-        if job[jobs.WAVELENGTH] > 0 and job[jobs.BY_POWERS] != 0:
-            multiply_by_powers(job, place_of(job, codes, 1), rows)
+        if job[jobs.WAVELENGTH] > 0 and codes[SUMMED] > 0:
+            multiply_by_powers(job, place_of(job, codes, 1), codes[SUMMED], rows)
             return
         sum_other(job, codes, 1, lanes, rows, shifted(rows, SUM))
         r = carray(rows, UNBOUNDED)
@@ -328,8 +329,9 @@ def cosine_series(real: types.Type) -> CosineSeries:
     @njit(**INLINED)
     def keep(job, codes, lanes, rows, own):  # noqa: ANN001, ANN202
         """Fill the rows of a step's series, of its slope, and of the share behind it."""
-        if job[jobs.WAVELENGTH] > 0 and job[jobs.BY_POWERS] != 0:
-            keep_powers(job, place_of(job, codes, 1), scale_of(job, codes), rows, own)
+        if job[jobs.WAVELENGTH] > 0 and codes[SUMMED] > 0:
+            scale = scale_of(job, codes)
+            keep_powers(job, place_of(job, codes, 1), codes[SUMMED], scale, rows, own)
             return
         sum_other(job, codes, 1, lanes, rows, shifted(own, FACTORS))
         sum_other(job, codes, 2, lanes, rows, shifted(own, SLOPES))

@@ -32,8 +32,7 @@ INDEX_ENTRIES, INDEX_ROWS, INDEX_COLUMNS, INDEX_WEIGHTS = range(66, 70)
 # from one lens to the next: pairs of place and bytes, and how many pairs.
 INNER_DRIVER, INNER_PIECES, STRIDES, STRIDE_PAIRS = range(70, 74)
 # Of losses: their numbers; where among these ratios and coefficients begin; how many series there
-# are, and their terms; whether media absorb; where the sums of these numbers begin, or zero; and
-# whether series are sums of powers.
+# are, and their terms; whether media absorb; where the sums of these numbers begin, or zero.
 LOSSES, RATIOS, COEFFICIENTS, SERIES, TERMS, ABSORBS, LOSS_SUMS = range(74, 81)
-TRANSMISSION_COTANGENT, TRANSMISSION_COTANGENT_ROW, BY_POWERS = range(81, 84)
+TRANSMISSION_COTANGENT, TRANSMISSION_COTANGENT_ROW = range(81, 83)
 LENGTH = 88  # of a job: whole lines of the cache

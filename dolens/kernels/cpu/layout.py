@@ -101,9 +101,9 @@ STARTS_ON_CONIC, STENCIL = Code.ROW + 5, Code.ROW + 6
 PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 7, Code.ROW + 10)
 # Those of the even asphere that other shapes add to.
 ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 10, Code.ROW + 13)
-# Which series of a table of losses a step has, plus one, or zero; and a `Cosine`.
-LOSS, COSINE = range(Code.ROW + 13, Code.ROW + 15)
-CODE_ROW = Code.ROW + 15
+# A row of `LossTable.steps`: its series plus one, or zero; and the rest.
+LOSS, COSINE, SUMMED = range(Code.ROW + 13, Code.ROW + 16)
+CODE_ROW = Code.ROW + 16
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 DEFLECT, SPHERE, CONIC = int(Kind.DEFLECT), int(Kind.SPHERE), int(Kind.CONIC)

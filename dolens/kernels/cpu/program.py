@@ -54,6 +54,7 @@ from dolens.kernels.cpu.layout import (
     STATE,
     STENCIL,
     STENCIL_NUMBERS,
+    SUMMED,
     WORK_ROWS,
 )
 from dolens.kernels.cpu.plane import lossy_plane_adjoint, plane_adjoint, plane_forward
@@ -123,8 +124,9 @@ def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool, losses: 
     rows = np.zeros((max(len(table), 1), CODE_ROW), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
     if losses:
-        series = np.frombuffer(losses, dtype=np.int64).reshape(-1, 2)
-        rows[: len(table), LOSS], rows[: len(table), COSINE] = series[:, 0] + 1, series[:, 1]
+        series = np.frombuffer(losses, dtype=np.int64).reshape(-1, 3)
+        rows[: len(table), [LOSS, COSINE, SUMMED]] = series
+        rows[: len(table), LOSS] += 1
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
         if row[Code.KIND] == Kind.DEFLECT:
@@ -312,7 +314,6 @@ class Program:
         terms = losses.numbers.numel() - coefficients
         terms //= max(3 * losses.series * wavelengths, 1)
         self._losses = losses  # held
-        self.job[jobs.BY_POWERS] = int(losses.powers)
         # Neighbours in a job.
         self.job[jobs.LOSSES : jobs.ABSORBS + 1] = (
             *(losses.numbers.data_ptr(), ratios, coefficients),
