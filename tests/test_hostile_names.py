@@ -88,7 +88,7 @@ def test_other_signs_of_a_name_come_back(suffix):
 def test_a_terminal_shows_names_and_obeys_none(given, lens_file, monkeypatch):
     monkeypatch.setattr(
         "dolens.lens_page.overview.lens_overview",
-        lambda lens: SimpleNamespace(name=lens.name, summary="", sections=[]),
+        lambda lens, ghosts: SimpleNamespace(name=lens.name, summary="", sections=[]),
     )
     output = CliRunner().invoke(app, given, catch_exceptions=False).output
     assert all(line.isprintable() for line in output.splitlines())

@@ -235,16 +235,21 @@ def _computed_series(
     cosine = Cosine.ARRIVING
     if thinner:
         cosine = Cosine.BEYOND if mirror else Cosine.LEAVING
-    for terms in _TERMS:
+
+    def coefficients(terms: int) -> Tensor:
         u = nodes(terms).to(waves).expand(len(waves), terms)
         if thinner:
             u = (1.0 - (1.0 - u.square()) / ratio.square()).sqrt()
         r_s, r_p, t_s, t_p = coating.shares(front, behind, u, waves)
-        coefficients = series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p))
-        if float(coefficients[:, -_LAST:].detach().abs().max()) <= tolerance:
-            beyond = ratio if cosine == Cosine.BEYOND else torch.ones_like(waves)
-            return SurfaceSeries(coefficients, cosine, beyond)
-    return None
+        return series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p))
+
+    with torch.no_grad():  # a graph would take most of the time
+        last = ((terms, coefficients(terms)[:, -_LAST:].abs().max()) for terms in _TERMS)
+        enough = next((terms for terms, most in last if float(most) <= tolerance), None)
+    if enough is None:
+        return None
+    beyond = ratio if cosine == Cosine.BEYOND else torch.ones_like(waves)
+    return SurfaceSeries(coefficients(enough), cosine, beyond)
 
 
 def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) -> LossTable:

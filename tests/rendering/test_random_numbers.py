@@ -44,18 +44,26 @@ def test_words_are_the_published_hash(pixel, sample, seed):
 
 
 def test_kernels_have_the_same_bits():
+    """They are called from compiled code, as kernels do: Python cannot call them."""
     import numpy as np
+    from numba import njit
 
     from dolens.kernels.cpu.rendering import pixel_samples as kernel
 
+    words_of, bits_of = kernel.random_words, kernel.upper_bits
+
+    @njit
+    def drawn(pixel, sample, low, high):
+        words = words_of(pixel, sample, low, high)
+        return words, (bits_of(words[0]), bits_of(words[1]), bits_of(words[2]), bits_of(words[3]))
+
     for pixel, sample, seed in COUNTERS:
         counters = (np.uint32(c) for c in (pixel, sample, seed & MASK, seed >> 32))
-        found = kernel.random_words(*counters)
+        found, upper = drawn(*counters)
         expected = random_words(seed, torch.tensor(pixel), torch.tensor(sample))
         assert tuple(map(int, found)) == tuple(map(int, expected))
-        upper = [int(kernel.upper_bits(np.uint32(word))) for word in found]
         numbers = [uniform(word, torch.float64) for word in expected]
-        assert [u * 2.0**-24 for u in upper] == [float(n) for n in numbers]
+        assert [int(u) * 2.0**-24 for u in upper] == [float(n) for n in numbers]
 
 
 def test_numbers_are_the_same_in_either_precision():

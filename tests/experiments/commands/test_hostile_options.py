@@ -123,7 +123,7 @@ def at_work(work, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
     monkeypatch.setattr("dolens.lens_page.page.write_page", lambda *_, **__: Written())
     nothing = SimpleNamespace(name="", summary="", sections=[])
-    monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda _: nothing)
+    monkeypatch.setattr("dolens.lens_page.overview.lens_overview", lambda lens, ghosts: nothing)
     for name in ("apply", "restore"):
         monkeypatch.setattr(PictureCamera, name, lambda *_: [])
     monkeypatch.setattr(AppliedLens, "apply", lambda *_: [])
