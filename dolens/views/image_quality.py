@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
@@ -383,7 +384,8 @@ class ImageQualityViews:
         """Return which share of the light arrives, by field, wavelength and surface; it shows
         itself as text or HTML, and `figure()` plots it.
 
-        Surfaces without a coating are ideal, and lose nothing; see `coated`.
+        Surfaces without a coating are ideal, and lose nothing; see `coated`.  The numbers have no
+        gradients; those of `analysis.transmission.transmission` have.
 
         Example:
             >>> import dolens
@@ -401,7 +403,8 @@ class ImageQualityViews:
         from dolens.analysis.transmission import transmission
 
         lens, given = looked_at(self.transmission, fields, wavelengths, object_distance, aperture)
-        return transmission(lens, given)
+        with torch.no_grad():
+            return transmission(lens, given)
 
     def relative_illumination(
         self,
