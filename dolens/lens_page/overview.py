@@ -11,10 +11,11 @@ from dolens.analysis.fields_and_wavelengths import as_wavelengths, field_points,
 from dolens.analysis.paraxial_data import first_order_numbers
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
-from dolens.lens_page.ghosts import ghost_tables, ghosts_of_fields
 from dolens.lens_page.tables import (
     Table,
     first_order_table,
+    ghost_tables,
+    ghosts_of_fields,
     number,
     prescription_tables,
     seidel_table,

@@ -37,13 +37,12 @@ from dolens.diffraction.wavefront_map import (
     wavefront_maps,
 )
 from dolens.errors import InputError
-from dolens.lens_page.ghosts import ghost_tables, ghosts_of_fields
 from dolens.lens_page.in_space import HANDS
 from dolens.lens_page.markup import View, view
 from dolens.lens_page.offenders import bright_fields, offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table, number
+from dolens.lens_page.tables import Table, ghost_tables, ghosts_of_fields, number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.field_curves import (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.analysis.conditions import Conditions
+from dolens.analysis.ghosts import ghosts
 from dolens.analysis.paraxial_data import ABERRATIONS, first_order_numbers, seidel_sums
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.optics.elements import POSE, TILTS
@@ -18,9 +19,12 @@ from dolens.optics.surfaces import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Outline, Rectangle, Unlimited
 from dolens.optics.surfaces.coordinate_break import BREAK
+from dolens.views.ghosts import HEADINGS, NOTE, LensGhosts
 
 # Columns of coefficients that a page and a terminal are wide enough for.
 _MOST_TERMS = 6
+# Rows of a table of ghosts.
+_MOST_GHOSTS = 8
 
 
 @dataclass(frozen=True)
@@ -279,3 +283,25 @@ def _outline(outline: Outline) -> str:
 
 def _is_glass(row: SurfaceRow) -> bool:
     return row.material not in ("", *NO_GLASS)
+
+
+def ghosts_of_fields(lens: Lens, where: Conditions) -> list[LensGhosts]:
+    """Return the ghosts of a source at each field, at the reference wavelength.
+
+    Raises:
+        InputError: fewer than two surfaces reflect light, or none of a field enters.
+    """
+    at = [where.at(field[None], where.reference_wavelength) for field in where.fields]
+    return [LensGhosts(lens, ghosts(lens, one)) for one in at]
+
+
+def ghost_tables(found: Sequence[LensGhosts]) -> list[Table]:
+    """Return a table of the brightest ghosts of each field; the last says what numbers mean."""
+    tables = []
+    for one in found:
+        rows = one.rows(_MOST_GHOSTS)
+        caption = f"{one.heading}.  {one.rest(len(rows))}"
+        if one is found[-1]:
+            caption += NOTE
+        tables.append(Table(HEADINGS, rows, caption.strip(), frozenset({0, len(HEADINGS) - 1})))
+    return tables

@@ -12,13 +12,13 @@ The numbers behind each figure come from the functions that the methods call.
 from dolens.views.design import DesignViews
 from dolens.views.ghosts import GhostViews
 from dolens.views.image_quality import ImageQualityViews
+from dolens.views.light import LightViews
 from dolens.views.overview import OverviewViews
 from dolens.views.photographs import PhotographViews
-from dolens.views.polarisation import PolarisationViews
 
 
 class LensViews(
-    OverviewViews, ImageQualityViews, PolarisationViews, GhostViews, DesignViews, PhotographViews
+    OverviewViews, ImageQualityViews, LightViews, GhostViews, DesignViews, PhotographViews
 ):
     """Methods of `Lens` that show it.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolens.analysis.fields_and_wavelengths import FieldPoints
-    from dolens.analysis.transmission import Transmission
     from dolens.views.overview import Wavelengths
 
 KINDS = ("fourier", "huygens")
@@ -373,38 +371,6 @@ class ImageQualityViews:
         over_wave = rms_against_wavelength(lens, given, wavelength_interval(lens))
         title = title_of("RMS spot radius", lens, given)
         return shown(rms_curves_figure(over_field, over_wave, title))
-
-    def transmission(
-        self,
-        fields: FieldPoints | None = None,
-        wavelengths: Wavelengths = None,
-        object_distance: float | None = None,
-        **aperture: float,
-    ) -> Transmission:
-        """Return which share of the light arrives, by field, wavelength and surface; it shows
-        itself as text or HTML, and `figure()` plots it.
-
-        Surfaces without a coating are ideal, and lose nothing; see `coated`.  The numbers have no
-        gradients; those of `analysis.transmission.transmission` have.
-
-        Example:
-            >>> import dolens
-            >>> bare = dolens.load_lens("cooke_triplet").coated("none")
-            >>> coated = bare.coated("quarter_wave")
-            >>> [round(float(x.transmission(0.0, 550).share), 3) for x in (bare, coated)]
-            [0.706, 0.963]
-
-        Args:
-            fields: see the class, as the other arguments that are not named here.
-            wavelengths: see the class.
-            object_distance: see the class.
-            aperture: see the class.
-        """
-        from dolens.analysis.transmission import transmission
-
-        lens, given = looked_at(self.transmission, fields, wavelengths, object_distance, aperture)
-        with torch.no_grad():
-            return transmission(lens, given)
 
     def relative_illumination(
         self,

@@ -36,27 +36,6 @@ class OverviewViews:
         lens, given = looked_at(self.summary, fields, wavelengths, object_distance, aperture)
         return lens_summary(lens, given)
 
-    def coated(self, coating: Any) -> Lens:
-        """Return a copy of this lens with coatings, as a prescription writes them.
-
-        Example:
-            >>> import dolens
-            >>> lens = dolens.load_lens("cooke_triplet")
-            >>> print(lens.coated({1: "none", 2: "quarter_wave"}).prescription().notes[1])
-            coating of surface 2: INFRARED:MGF2 99.7 nm
-
-        Args:
-            coating: `ideal`, `none`, `quarter_wave`, layers or a table, for all surfaces between
-                air and glass, cemented ones being bare; or surface number → coating, for these
-                alone.  See `dolens.prescriptions.coatings`.
-
-        Raises:
-            InputError: one line that names the surface, the key, and what is allowed.
-        """
-        from dolens.prescriptions.coatings import coated
-
-        return coated(as_lens(self), coating)
-
     def explain(self, rays: Rays) -> RayPath:
         """Follow one ray surface by surface, and say why it ends where it does.
 
