@@ -6,10 +6,10 @@ through it.  These are means over the pupil.  Light leaves a surface partly
 polarised, and so meets the next one; this is left out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from dolens.optics.fields import point_text
 from dolens.optics.glass import Glass
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass, media_of
+from dolens.optics.system import OpticalSystem
 from dolens.optics.text_tables import html_table, printable, text_table
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor
 
@@ -55,11 +56,6 @@ class Transmission(AtConditions):
     unknown: tuple[str, ...]
 
     @property
-    def wavelengths(self) -> Tensor:
-        """Return the wavelengths (W,), nm."""
-        return self.where.wavelengths
-
-    @property
     def polychromatic(self) -> Tensor:
         """Return the mean over the wavelengths by their weights, (F,)."""
         return self.share @ self.where.weights
@@ -70,17 +66,11 @@ class Transmission(AtConditions):
         found = [f"The shares are off by {float(self.error.max()):.1g} or less."]
         if self.ideal:
             count = len(self.ideal)
-            which = "All surfaces" if self.is_ideal else f"{count} of the surfaces"
-            found.append(f"{which} are ideal: they have no coating, and lose nothing.")
+            found.append(f"{count} of the surfaces are ideal: no coating, and nothing lost.")
         if self.unknown:
             names = ", ".join(self.unknown)
             found.append(f"No internal transmittance is known of {names}: taken as clear.")
         return [printable(note) for note in found]
-
-    @property
-    def is_ideal(self) -> bool:
-        """Return whether no surface loses light."""
-        return bool((self.surfaces == 1.0).all())
 
     def cells(self) -> list[list[str]]:
         """Return rows of field and share in per cent at each wavelength and of all."""
@@ -171,6 +161,28 @@ def transmission(lens: Lens, where: Conditions) -> Transmission:
     )
 
 
+def reflectances(
+    system: OpticalSystem, wavelengths: Sequence[float] | Tensor, angles: Sequence[float]
+) -> dict[int, Tensor]:
+    """Return what coatings reflect of unpolarised light, number of a surface → shares (W, A).
+
+    Args:
+        system: the lens.
+        wavelengths: (W,), nm.
+        angles: (A,), degrees of incidence in front of each surface.
+    """
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
+    waves = torch.as_tensor(wavelengths, **options)[:, None]
+    cosines = torch.deg2rad(torch.as_tensor(angles, **options)).cos().expand(len(waves), -1)
+    indices = [torch.as_tensor(n, **options) for n in system.indices(waves)]
+    found = {}
+    for number, surface in enumerate(system.surfaces, 1):
+        if surface.coating is not None:
+            front, behind = indices[number - 1 : number + 1]
+            found[number] = surface.coating.shares(front, behind, cosines, waves).reflected
+    return found
+
+
 def _means(lens: Lens, spots: SpotRays, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the shares of the whole lens, of its surfaces and of its media over the pupil."""
     system = lens.system()
@@ -213,9 +225,8 @@ def unknown_glasses(lens: Lens, wavelengths: list[float]) -> list[str]:
     """Return the names of the solid media whose absorption is not known at one of the wavelengths
     (nm).
     """
-    media = media_of(lens.materials).materials
     # Light travels in a medium between two surfaces.
-    solid = [m for m, _ in pairwise(media[1:]) if is_glass(m)]
+    solid = filter(is_glass, media_of(lens.materials).materials[1:-1])
     unknown = (
         m.name
         for m in solid

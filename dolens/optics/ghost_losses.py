@@ -5,10 +5,15 @@ the series of each is found once, and that of a path is put together.
 """
 
 import torch
-from torch.nn.functional import pad
 
 from dolens.optics.ghost_paths import Path, unfolded
-from dolens.optics.losses import Losses, SurfaceSeries, surface_series
+from dolens.optics.losses import (
+    Losses,
+    SurfaceSeries,
+    absorption_of,
+    joined_losses,
+    surface_series,
+)
 from dolens.optics.system import OpticalSystem
 
 # Of shares, of which the least that count are some 1e-3.
@@ -26,9 +31,7 @@ class GhostLosses:
     def __init__(self, system: OpticalSystem, wavelength: float) -> None:
         self.count = len(system.surfaces)
         self.waves = torch.tensor([wavelength], dtype=torch.float64, device=system.device)
-        alphas = system.absorptions(self.waves)
-        absorptions = [torch.as_tensor(a, dtype=torch.float64).expand(1) for a in alphas]
-        self.absorption = torch.stack(absorptions).to(system.device)
+        self.absorption = absorption_of(system, self.waves)
         self.known: dict[tuple[int, bool, bool], SurfaceSeries | None] = {}
 
     def of(self, path: Path, ghost: OpticalSystem) -> Losses | None:
@@ -48,16 +51,8 @@ class GhostLosses:
             if key not in self.known:
                 number = place + 1
                 self.known[key] = surface_series(ghost, number, self.waves, 1.0, _TOLERANCE)
-        found = [self.known[key] for key in keys.values()]
-        rows = [row for row in found if row is not None]
-        if len(rows) < len(found):
+        rows = {place + 1: self.known[key] for place, key in keys.items()}
+        found = {number: row for number, row in rows.items() if row is not None}
+        if len(found) < len(rows):
             return None
-        most = max((len(row.coefficients[0]) for row in rows), default=1)
-        series = [pad(row.coefficients, (0, most - row.coefficients.shape[1])) for row in rows]
-        return Losses(
-            tuple(place + 1 for place in keys),
-            torch.stack(series) if rows else self.waves.new_zeros(0, 1, most),
-            tuple(row.cosine for row in rows),
-            ratios=torch.stack([row.ratio[:, 0] for row in rows]) if rows else None,
-            absorption=self.absorption[list(way.media)] if bool(self.absorption.any()) else None,
-        )
+        return joined_losses(found, self.absorption[list(way.media)])

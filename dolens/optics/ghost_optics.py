@@ -141,12 +141,12 @@ class NormalIncidence:
                 continue
             onward = coating.shares(front, behind, along, wavelength)
             if number in system.mirrors:
-                self.passed[number] = 0.5 * (onward.r_s + onward.r_p)
+                self.passed[number] = onward.reflected
                 continue
             back = coating.turned_round().shares(behind, front, along, wavelength)
-            self.passed[number] = 0.5 * (onward.t_s + onward.t_p)
-            self.reflected[number, True] = 0.5 * (onward.r_s + onward.r_p)
-            self.reflected[number, False] = 0.5 * (back.r_s + back.r_p)
+            self.passed[number] = onward.passed
+            self.reflected[number, True] = onward.reflected
+            self.reflected[number, False] = back.reflected
         self.reflected[self.count + 1, True] = zero + sensor_reflectance
 
     def share(self, path: Path) -> Tensor:

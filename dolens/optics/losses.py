@@ -7,6 +7,7 @@ on from them to whatever a coating is made of.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -135,9 +136,22 @@ def losses_of(
             if one is None:
                 return None
             found[number] = one
-    alphas = system.absorptions(waves[:, 0])
-    absorptions = [torch.as_tensor(alpha, dtype=torch.float64) for alpha in alphas]
-    clear = not any(bool((a != 0.0).any()) for a in absorptions)
+    return joined_losses(found, absorption_of(system, waves[:, 0]))
+
+
+def absorption_of(system: OpticalSystem, wavelengths: Tensor) -> Tensor:
+    """Return the absorption (media, W), 1/mm, in double precision, at wavelengths (W,), nm."""
+    alphas = (torch.as_tensor(a, dtype=torch.float64) for a in system.absorptions(wavelengths))
+    return torch.stack([alpha.to(wavelengths.device).expand(len(wavelengths)) for alpha in alphas])
+
+
+def joined_losses(found: Mapping[int, SurfaceSeries], absorption: Tensor) -> Losses:
+    """Return the losses of a lens.
+
+    Args:
+        found: number of a surface → its series.
+        absorption: (media, W), 1/mm.
+    """
     longest = max((one.coefficients.shape[-1] for one in found.values()), default=_GROUP)
     padded = [
         pad(one.coefficients, (0, longest - one.coefficients.shape[-1])) for one in found.values()
@@ -146,11 +160,10 @@ def losses_of(
     ratios = [one.ratio[:, 0] for one in found.values()]
     return Losses(
         tuple(found),
-        torch.stack(padded) if padded else waves.new_zeros((0, len(waves), longest)),
+        torch.stack(padded) if padded else absorption.new_zeros((0, absorption.shape[1], longest)),
         cosines,
-        (),
-        torch.stack(ratios) if Cosine.BEYOND in cosines else None,
-        None if clear else torch.stack([a.expand(len(waves)) for a in absorptions]),
+        ratios=torch.stack(ratios) if Cosine.BEYOND in cosines else None,
+        absorption=absorption if bool(absorption.any()) else None,
     )
 
 
@@ -240,8 +253,8 @@ def _computed_series(
         u = nodes(terms).to(waves).expand(len(waves), terms)
         if thinner:
             u = (1.0 - (1.0 - u.square()) / ratio.square()).sqrt()
-        r_s, r_p, t_s, t_p = coating.shares(front, behind, u, waves)
-        return series(0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p))
+        found = coating.shares(front, behind, u, waves)
+        return series(found.reflected if mirror else found.passed)
 
     with torch.no_grad():  # a graph would take most of the time
         last = ((terms, coefficients(terms)[:, -_LAST:].abs().max()) for terms in _TERMS)

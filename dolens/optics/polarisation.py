@@ -42,7 +42,6 @@ from dolens.optics.system import OpticalSystem
 from dolens.optics.thin_films import Parts
 from dolens.optics.trace import (
     Crossing,
-    Shares,
     enter_lens,
     stop_gradient_where_invalid,
     trace_surfaces,
@@ -140,10 +139,13 @@ def trace_polarised(system: OpticalSystem, rays: Rays) -> PolarisedRays:
     ray, before = enter_lens(system, rays, 1, 1.0)
     crossings: list[Crossing] = []
     wavelength = rays.wavelength
-    traced = trace_surfaces(system, ray, wavelength, path_length=True, crossings=crossings)
+    # Of ideal surfaces the shares are those of the glasses alone.
+    ideal = system.uncoated()
+    traced = trace_surfaces(
+        ideal, ray, wavelength, path_length=True, transmission=True, crossings=crossings
+    )
+    traced = trace_to_sensor(ideal, traced, wavelength)
     field = _Field(system, crossings, wavelength)
-    passed = torch.exp(-field.absorbed) if isinstance(field.absorbed, Tensor) else 1.0
-    traced = trace_to_sensor(system, replace(traced, shares=[Shares(passed, 1.0)]), wavelength)
     media = math.prod(share.medium for share in traced.shares or [])
     power = media * field.flux
     root = None
@@ -183,7 +185,6 @@ class _Field:
         behind: the same, carried behind the last surface.
         jones: J₁₁, J₁₂, J₂₁, J₂₂; empty where no surface changes the field.
         flux: ∏ n'·cos θ'/(n·cos θ) of the surfaces with a coating.
-        absorbed: Σ a·t, of the glasses' absorption up to the last surface.
     """
 
     def __init__(
@@ -197,12 +198,7 @@ class _Field:
         self.behind = self.front
         self.jones: list[Parts] = []
         self.flux: Tensor | float = 1.0
-        self.absorbed: Tensor | float = 0.0
-        absorptions = system.absorptions(wavelength)
         for crossing in crossings:
-            rate = absorptions[crossing.passed]
-            if isinstance(rate, Tensor) or rate != 0.0:
-                self.absorbed = self.absorbed + rate * crossing.distance
             self._cross(crossing)
 
     def _cross(self, crossing: Crossing) -> None:

@@ -48,6 +48,16 @@ class Polarised(NamedTuple):
     t_s: Tensor
     t_p: Tensor
 
+    @property
+    def reflected(self) -> Tensor:
+        """Return the share of unpolarised light that is reflected, of shares."""
+        return 0.5 * (self.r_s + self.r_p)
+
+    @property
+    def passed(self) -> Tensor:
+        """Return the share of unpolarised light that passes, of shares."""
+        return 0.5 * (self.t_s + self.t_p)
+
 
 class Parts(NamedTuple):
     """A complex number (...) as two real ones; a product with real ones takes half of the time.

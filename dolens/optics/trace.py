@@ -55,8 +55,6 @@ class Crossing(NamedTuple):
         arriving: direction in front of the surface.
         leaving: direction behind it.
         indices: in front and behind.
-        passed: the medium in front counts from 0, as `OpticalSystem.materials` does.
-        distance: mm, through that medium.
         axes: of the surface.
     """
 
@@ -65,8 +63,6 @@ class Crossing(NamedTuple):
     arriving: tuple[Tensor, Tensor, Tensor]
     leaving: tuple[Tensor, Tensor, Tensor]
     indices: tuple[float | Tensor, float | Tensor]
-    passed: int
-    distance: Tensor
     axes: Axes
 
 
@@ -265,12 +261,12 @@ def trace_surfaces(
             surface, here, arriving, system.from_the_side
         )
         inside = surface.aperture.margin(x, y)
-        if path is not None:
-            path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
+        if path is not None or shares is not None:
+            distance = to_plane + t if carried is None else carried + to_plane + t
+            path = None if path is None else path + before * distance
         if record:
             points.append(points_to_lens_axes((x, y, z), axes))
         if shares is not None:
-            distance = to_plane + t if carried is None else carried + to_plane + t
             passes: Tensor | float = 1.0
             if surface.coating is not None:
                 passes = surface_share(
@@ -292,11 +288,8 @@ def trace_surfaces(
             )
         margins.append(Margins(number, met, inside, transmitted))
         if crossings is not None:
-            distance = to_plane + t if carried is None else carried + to_plane + t
             crossings.append(
-                Crossing(
-                    number, (x, y, z), here[3:], (l, m, n), (before, after), front, distance, axes
-                )
+                Crossing(number, (x, y, z), here[3:], (l, m, n), (before, after), axes)
             )
         ray = Components(x, y, z, l, m, n)
     valid = _all_positive(margins, ray.n)
@@ -336,8 +329,8 @@ def surface_share(
     if not (mirror or forward):
         coating = coating.turned_round()
     cosine = surface.cosine_of_incidence(point, direction)
-    r_s, r_p, t_s, t_p = coating.shares(*indices, cosine, wavelength)
-    return 0.5 * (r_s + r_p) if mirror else 0.5 * (t_s + t_p)
+    found = coating.shares(*indices, cosine, wavelength)
+    return found.reflected if mirror else found.passed
 
 
 def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.transmission import reflectances
 from dolens.errors import InputError
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.lens import Lens
@@ -49,20 +50,14 @@ class Reflectance(Operand):
 
     def values(self, lens: LensProperties) -> dict[str, Tensor]:
         """Return what each surface reflects at each wavelength and angle."""
-        system = lens.system
-        options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
-        cosines = torch.deg2rad(torch.tensor(self.angles, **options)).cos()
-        found = {}
-        for number, surface in enumerate(system.surfaces, 1):
-            coating = surface.coating
-            if coating is None or (self.surfaces is not None and number not in self.surfaces):
-                continue
-            for nm in self.wavelengths or (lens.wavelength,):
-                before, behind = system.indices(nm)[number - 1 : number + 1]
-                r_s, r_p, _, _ = coating.shares(before, behind, cosines, nm)
-                for angle, share in zip(self.angles, (50.0 * (r_s + r_p)).unbind(), strict=True):
-                    found[f"{self.kind}/{number}/{nm:g}/{angle:g}"] = share
-        return found
+        waves = self.wavelengths or (lens.wavelength,)
+        return {
+            f"{self.kind}/{number}/{nm:g}/{angle:g}": 100.0 * share
+            for number, shares in reflectances(lens.system, waves, self.angles).items()
+            if self.surfaces is None or number in self.surfaces
+            for nm, row in zip(waves, shares, strict=True)
+            for angle, share in zip(self.angles, row.unbind(), strict=True)
+        }
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.analysis.conditions import wavelength_interval
-from dolens.analysis.transmission import Transmission
+from dolens.analysis.transmission import Transmission, reflectances
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.style import (
@@ -102,13 +102,5 @@ def mean_reflectance(lens: Lens, wavelengths: Tensor, angle: float) -> Tensor:
     """Return the share of unpolarised light that coatings reflect, the mean over the coated
     surfaces, at wavelengths (nm) and an angle of incidence (degrees).
     """
-    system = lens.system()
-    indices = [torch.as_tensor(n, dtype=torch.float64) for n in system.indices(wavelengths)]
-    cosine = torch.deg2rad(torch.tensor(angle, dtype=torch.float64)).cos().expand_as(wavelengths)
-    found = []
-    for number, surface in enumerate(system.surfaces):
-        if surface.coating is not None:
-            before, behind = indices[number], indices[number + 1]
-            r_s, r_p, _, _ = surface.coating.shares(before, behind, cosine, wavelengths)
-            found.append(0.5 * (r_s + r_p))
-    return torch.stack(found).mean(0)
+    found = reflectances(lens.system(), wavelengths, (angle,))
+    return torch.stack([*found.values()]).mean(0)[:, 0]

@@ -184,7 +184,8 @@ def lens_from_prescription(
     if prescription.get(COATING_KEY) is not None:
         uncoated = [n for n, row in enumerate(rows, 1) if row.get(COATING_KEY) is None]
         common = prescription[COATING_KEY]
-        for number, own in coatings_for(surfaces, materials, uncoated, common, where, model, air):
+        found = coatings_for(surfaces, materials, uncoated, common, where, model, air, dtype)
+        for number, own in found:
             surfaces[number - 1].coating = own
     try:
         lens = Lens(

@@ -48,6 +48,7 @@ from dolens.optics.materials import (
 )
 from dolens.optics.surfaces import Surface
 from dolens.prescriptions.numbers import as_number, as_positive
+from dolens.prescriptions.row_data import environment_of
 
 COATING_KEY = "coating"
 IDEAL, BARE, QUARTER_WAVE = "ideal", "none", "quarter_wave"
@@ -142,6 +143,7 @@ def coatings_for(
     place: str,
     model: IndexModel,
     air: Environment | None,
+    dtype: torch.dtype,
 ) -> Iterator[tuple[int, Coating | None]]:
     """Yield the numbers of those surfaces that a coating of the whole lens holds for, and theirs.
 
@@ -155,13 +157,13 @@ def coatings_for(
         place: begins messages.
         model: index model of the lens.
         air: temperature and pressure.
+        dtype: precision of the parameters.
     """
     media = media_of(materials).materials
     for number in numbers:
         surface, before, behind = surfaces[number - 1], media[number - 1], media[number]
         if surface.changes_axes or surface.law is not None or before == behind:
             continue
-        dtype = next(iter(surface.parameters()), torch.zeros((), dtype=torch.float64)).dtype
         found = coating_from(value, place, model, air, dtype)
         check_coating(found, behind, place)
         if found is not None and is_glass(before) and is_glass(behind):
@@ -182,15 +184,12 @@ def coated(lens: Lens, coating: Any) -> Lens:
     """
     found, model = copy.deepcopy(lens), index_model(lens.index_model)
     where = f"lens '{lens.name}'"
-    air = None
-    if lens.temperature is not None or lens.pressure is not None:
-        known = {"temperature": lens.temperature, "pressure": lens.pressure}
-        air = Environment(**{name: value for name, value in known.items() if value is not None})
+    air = environment_of({"temperature": lens.temperature, "pressure": lens.pressure}, where)
     surfaces = list(found.surfaces.values())
     if not isinstance(coating, Mapping) or any(form in coating for form in _FORMS):
         numbers = range(1, len(surfaces) + 1)
         for number, own in coatings_for(
-            surfaces, found.materials, numbers, coating, where, model, air
+            surfaces, found.materials, numbers, coating, where, model, air, lens.dtype
         ):
             surfaces[number - 1].coating = own
         return found

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import conditions
-from dolens.analysis.ghosts import ENTERING, IMAGE, chosen_paths, ghost_light
+from dolens.analysis.ghosts import ENTERING, IMAGE, chosen_paths, ghost_area, ghost_light
 from dolens.errors import InputError
 from dolens.kernels import rendering
 from dolens.optics.field_and_aperture import in_double_precision
@@ -125,9 +125,8 @@ def _cell(rows: Tensor, columns: Tensor) -> int:
     """Return the side, in pixels, of cells that hold enough of a ghost's rays; a power of two."""
     if len(rows) < 2:
         return _LARGEST_CELL
-    # An ellipse that is evenly lit has the area 4π·√det of its variances.
-    covariance = torch.cov(torch.stack((rows, columns)))
-    area = 4.0 * math.pi * math.sqrt(max(float(torch.linalg.det(covariance)), 0.0))
+    (xx, xy), (_, yy) = torch.cov(torch.stack((rows, columns)))
+    area = float(ghost_area(xx, xy, yy, 0.0))
     side = math.sqrt(_RAYS_A_CELL * area / len(rows))
     return min(_LARGEST_CELL, 2 ** max(0, math.ceil(math.log2(max(side, 1.0)))))
 

@@ -155,15 +155,12 @@ def design_figures(
         "modulation": transfer,
         "rms_curves": curves,
     }
-    coated = {n: one for n, one in {**(others or {}), "final": lens}.items() if _is_coated(one)}
+    compared_with = {**(others or {}), "final": lens}
+    coated = {name: one for name, one in compared_with.items() if one.system().coated}
     if coated:
         title = f"{shown_name(lens)}: what the coatings reflect"
         figures["reflectance"] = lambda: reflectance_figure(coated, title)
     return figures | history_figures(lens, history, initial_merit, merit_unit)
-
-
-def _is_coated(lens: Lens) -> bool:
-    return any(surface.coating is not None for surface in lens.surfaces.values())
 
 
 def history_figures(

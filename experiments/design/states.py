@@ -78,7 +78,7 @@ def spot_metrics(
     for label, radius in final.radii.items():
         numbers[f"rms_spot_um/final/{label}"] = radius
     for name, one in {**others, "final": lens}.items():
-        if any(surface.coating is not None for surface in one.surfaces.values()):
+        if one.system().coated:
             numbers |= light_metrics(name, one, settings)
     numbers["error/sampling_um"] = abs(spot_table(lens, settings, finer=True).mean - final.mean)
     logger.info(
