@@ -112,7 +112,7 @@ def test_every_block_is_held_by_a_test():
 def here(tmp_path_factory):
     """A reader's folder: lenses of several formats, a prescription of his own, an experiment."""
     folder = tmp_path_factory.mktemp("here")
-    for name in ("conf/lens", "conf/experiment", "lenses", "Zemax/Glasscat"):
+    for name in ("conf/lens", "conf/experiment", "lenses", "Zemax/Glasscat", "Zemax/Coatings"):
         (folder / name).mkdir(parents=True)
     triplet = load_lens("cooke_triplet")
     for name in (

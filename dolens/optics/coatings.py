@@ -185,8 +185,9 @@ class Table(CoatingState):
         angles: degrees, rising from 0.
         values: R_s, R_p, T_s, T_p, each (wavelengths, angles), as nested tuples.
 
-    The angles are those in front of the coating as light meets it in the lens.  Light from behind,
-    at the angle of the refracted ray, has the same shares.
+    The angles are those in front of the coating as light meets it in the lens, or behind it where
+    the table is turned.  Light from the other side, at the angle of the refracted ray, has the same
+    shares.
     """
 
     wavelengths: tuple[float, ...] = ()

@@ -15,12 +15,14 @@ and glass that have none of their own; cemented surfaces are then bare::
 
 Layers are in the order in which light meets them in the lens, their thicknesses in nm.  A
 `material` is a medium as elsewhere, a complex index [n, k], or rows [nm, n, k] of one.  Rows of a
-table are nm, degrees in front of the surface, and the shares of power R_s, R_p, T_s, T_p; they give
-every angle at every wavelength.  A mirror's coating needs the `substrate` behind its layers.
+table are nm, degrees in front of the surface (behind it with `angles: behind`), and the shares of
+power R_s, R_p, T_s, T_p; they give every angle at every wavelength.  A mirror's coating needs the
+`substrate` behind its layers.
 """
 
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -57,10 +59,12 @@ _NAMES = (IDEAL, BARE, QUARTER_WAVE)
 _USUAL_WAVELENGTH, _USUAL_FILM = 550.0, "MGF2"
 _FORMS = {
     QUARTER_WAVE: (QUARTER_WAVE, "material"),
-    "table": ("table",),
+    "table": ("table", "angles"),
     "layers": ("layers", "substrate"),
 }
 _MOST_LAYERS, _COLUMNS = 1000, 6
+# The side of a surface that the angles of a table are those of.
+_FRONT, _BEHIND = "front", "behind"
 
 
 def coating_from(
@@ -98,7 +102,9 @@ def _coating(
         raise InputError(f"has none of the keys {', '.join(_FORMS)}, and is none of {_NAMES}")
     check_keys(value, _FORMS[form], form)
     if form == "table":
-        return CoatingTable(_table(value["table"]))
+        side = str(value.get("angles", _FRONT))
+        check_choice(side, (_FRONT, _BEHIND), "'angles'")
+        return CoatingTable(replace(_table(value["table"]), turned=side == _BEHIND))
     if form == QUARTER_WAVE:
         wavelength = as_positive(value[QUARTER_WAVE], f"'{QUARTER_WAVE}'")
         film = _film(value.get("material", _USUAL_FILM), model, air)
@@ -208,13 +214,12 @@ def coating_row(coating: Coating) -> Any:
     """Return what `coating_from` reads back as the same coating, to the last bit."""
     if isinstance(coating, CoatingTable):
         table = coating.table
-        return {
-            "table": [
-                [nm, angle, *(rows[i][j] for rows in table.values)]
-                for i, nm in enumerate(table.wavelengths)
-                for j, angle in enumerate(table.angles)
-            ]
-        }
+        rows = [
+            [nm, angle, *(rows[i][j] for rows in table.values)]
+            for i, nm in enumerate(table.wavelengths)
+            for j, angle in enumerate(table.angles)
+        ]
+        return {"table": rows} | ({"angles": _BEHIND} if table.turned else {})
     thicknesses = [float(value.detach()) for value in coating.parameters()]
     layers = [
         {"material": _material_of(film), "thickness": thickness}

@@ -24,6 +24,7 @@ from dolens.prescriptions.plain_values import plain_values
 from dolens.prescriptions.row_data import elements_from
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUBLISHED_KEY
+from dolens.prescriptions.zemax.coatings import coating_files
 
 __all__ = [
     "SUFFIXES",
@@ -41,7 +42,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-GlassPlaces = Sequence[str | Path] | str | Path | None
+Places = Sequence[str | Path] | str | Path | None
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
@@ -222,7 +223,8 @@ def load_lens(
     dtype: torch.dtype = torch.float64,
     index_model: str | None = None,
     backend: str = "auto",
-    glass_catalogues: GlassPlaces = None,
+    glass_catalogues: Places = None,
+    coatings: Places = None,
 ) -> Lens:
     """Read a lens from a prescription in YAML, diffoptics's `.txt` or Zemax's `.zmx`.
 
@@ -236,20 +238,23 @@ def load_lens(
         backend: auto, reference, cpu or cuda.
         glass_catalogues: folders of `.agf` files, or such files, besides those that the environment
             variable `DOLENS_GLASS` names (see `dolens.optics.glass_catalog`).
+        coatings: Zemax's coating files (COATING.DAT), or folders of them, besides those of
+            `DOLENS_COATINGS`; they have the coatings that a `.zmx` file names (see
+            docs/coatings.md).
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    with glass_folders(glass_catalogues):
+    with glass_folders(glass_catalogues), coating_files(coatings):
         prescription, passed_over = read_lens_file(path)
         if passed_over:
             logger.info("%s: passed over: %s", path, "; ".join(passed_over))
         return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
-def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None) -> None:
+def save_lens(lens: Lens, path: str | Path, glass_catalogues: Places = None) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
     Reading it back gives the same parameters to the last bit.  YAML and JSON alone hold the numbers

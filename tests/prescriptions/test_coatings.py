@@ -227,6 +227,7 @@ def test_derivatives_of_the_share_are_those_of_differences(dtype):
         ({"layers": [], "substrate": SILVER}, "'substrate' is a mirror's"),
         ({"quarter_wave": 0}, "'quarter_wave' must be"),
         ({"table": []}, "'table' must be rows"),
+        ({"table": [[550, 0, 0, 0, 1, 1]], "angles": "inside"}, "'angles'.*front, behind"),
         ({"table": [[550, 0, 0.5, 0.5, 0.6, 0.5]]}, "R \\+ T at most 1"),
         ({"table": [[550, 95, 0.5, 0.5, 0.5, 0.5]]}, "95°"),
         ({"table": 2 * [[550, 0, 0.5, 0.5, 0.5, 0.5]]}, "given twice"),

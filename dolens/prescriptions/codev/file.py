@@ -38,6 +38,7 @@ _WITHOUT_EFFECT = {
         *("TRX", "TRY", "CYD", "CYN", "CYT", "TOL", "COM"),
     ),
     "polarization": ("POL",),
+    "coatings, whose .mul files are not read": ("MLT",),
     "settings of the program": ("CA", "CWL", "CLS", "DER", "DOR", "IC", "IFO", "ACO"),
     "": ("INI", "UID", "VIE", "WID"),
 }

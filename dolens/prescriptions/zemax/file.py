@@ -26,14 +26,14 @@ from dolens.prescriptions.numbers import as_number, number_in_text, scaled
 # What a surface's block may say about the way of light.
 SHAPE_OPERANDS = ("TYPE", "CURV", "CONI", "PARM", "XDAT", "DISZ", "GLAS")
 SURFACE_OPERANDS = (
-    *("STOP", "COMM", *SHAPE_OPERANDS, "HIDE", "SCBD", "GDAT", "GARR"),
+    *("STOP", "COMM", *SHAPE_OPERANDS, "HIDE", "SCBD", "GDAT", "GARR", "COAT"),
     *("DIAM", "CLAP", "FLAP", "SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "OBDC"),
     *("USAP", "USOB", "UDAD"),
 )
 # What a surface's block may say and bends no ray.  Others are passed over too, but where nothing is
 # indented only these are known to belong to a surface.
 UNREAD_OF_SURFACES = (
-    *("SSID", "FIMP", "MIRR", "SLAB", "MEMA", "OEMA", "POPS", "COAT", "SCAT", "SCOL", "BORD"),
+    *("SSID", "FIMP", "MIRR", "SLAB", "MEMA", "OEMA", "POPS", "SCAT", "SCOL", "BORD"),
     *("DRAW", "EDGE", "EDGV", "MAZH", "MAZA", "CHZH", "CHZA", "PZUP", "PPAR", "PKUP", "VDSZ"),
     *("VCON", "VPAR", "TOLE", "TCOM", "TCED", "TCEX", "TCE", "BOOK", "RAYS", "UNIF", "QTYP"),
 )

@@ -55,7 +55,6 @@ _USUAL_AIR = (20.0, 1.0)
 _GROUPS = {
     _DRAWING: ("MIRR", "SLAB", "SCOL", "DRAW", "SSID", "BOOK", "LAYR", "SUBS"),
     "mechanical sizes": ("MEMA", "OEMA", "BORD", "MECH", "TPDR"),
-    "coatings": ("COAT",),
     "scatter models": ("SCAT", "SCSF"),
     "physical optics": ("POPS", "POPD"),
     _SOLVES: (
@@ -172,7 +171,6 @@ def _differs(line: Line, usual: tuple[float, ...]) -> bool:
 # Lines that are always there, and which of them say anything.
 _SAYS: dict[str, Callable[[Line], bool]] = {
     "GFAC": _any_number,
-    "COAT": lambda line: bool(line.text),
     "SCAT": lambda line: bool(line.text),
     "FIMP": lambda line: bool(line.text),
     "POPS": lambda line: _differs(line, _USUAL_POPS),

@@ -1,9 +1,9 @@
 """The text of a Zemax `.zmx` file is converted to a prescription.
 
 Held: sequential systems of the shapes in `shapes`, glass by model (nd, Vd) or by its name
-in the catalogues of GCAT (`glass`), circular and rectangular apertures and obscurations
-(`apertures`), fields and wavelengths with their weights (`system`), and UNIT MM, CM, IN
-or METER.
+in the catalogues of GCAT (`glass`), coatings of a coating file (`coatings`), circular and
+rectangular apertures and obscurations (`apertures`), fields and wavelengths with their weights
+(`system`), and UNIT MM, CM, IN or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
 listed (`passed_over`).
 
@@ -44,11 +44,12 @@ from dolens.optics.materials import MIRROR
 from dolens.optics.surfaces.coordinate_break import BREAK, DECENTERS
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.numbers import number_in_text, radius_row, scaled
-from dolens.prescriptions.other_programs import ReadPrescription, curved_object
+from dolens.prescriptions.other_programs import D_LINE, ReadPrescription, curved_object
 from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax.apertures import is_fixed, read_apertures
+from dolens.prescriptions.zemax.coatings import Coatings
 from dolens.prescriptions.zemax.configurations import read_configurations
 from dolens.prescriptions.zemax.file import (
     Line,
@@ -145,16 +146,17 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     file = parse_zemax(text, where)
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image as SURF blocks")
-    read = partial(_current, glass=_glass_reader(file), where=where)
+    coatings = Coatings(file, where)
+    read = partial(_current, glass=_glass_reader(file), coatings=coatings, where=where)
     found = read(file)
     states, lost = read_configurations(file, found, read, where)
     if states:
         found[STATES_KEY] = states
     curved = _curved_object(file, found, factor_to_mm(file, where), where)
-    return ReadPrescription(found, [*passed_over(file), *curved, *lost])
+    return ReadPrescription(found, [*passed_over(file), *coatings.passed_over(), *curved, *lost])
 
 
-def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
+def _current(file: ZemaxFile, glass: GlassReader, coatings: Coatings, where: str) -> dict[str, Any]:
     """Return the prescription of the current configuration."""
     factor = factor_to_mm(file, where)
     medium, distance = _object(file, glass, factor, where)
@@ -163,13 +165,17 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
     refuse_own_air(file, where)
     prescription["stop"] = 1
     prescription["object_material"] = medium
+    prescription |= coatings.common()
+    primary = prescription.get("reference_wavelength", D_LINE)
+    waves = [primary, *prescription.get("wavelengths", [])]
+    coating = partial(coatings.row, waves=waves)
     pupil = not prescription.keys().isdisjoint(PUPIL_KEYS)
     rows, hard, stops = [], [], []
     for n, lines in enumerate(file.surfaces[1:-1], 1):
         if _is_ignored(lines):
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
-        row, clips = _row(block, glass, pupil)
+        row, clips = _row(block, glass, coating, pupil)
         before, after = _own_axes(block)
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
@@ -219,12 +225,15 @@ def _glass_reader(file: ZemaxFile) -> GlassReader:
     return glass
 
 
-def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, bool]:
+def _row(
+    block: SurfaceBlock, glass: GlassReader, coating: Callable[..., Row], pupil: bool
+) -> tuple[Row, bool]:
     """Return the row of a surface, and whether its aperture stops light.
 
     Args:
         block: its lines.
         glass: reads the words of GLAS.
+        coating: reads COAT.
         pupil: whether the file gives the pupil, which then sizes the stop.
     """
     shape = shape_of_block(block)
@@ -234,7 +243,7 @@ def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, boo
     if shape.surface:
         material = glass(block.words("GLAS"), place=block.place)
         block = replace(block, material=material)
-        row["material"] = material
+        row |= {"material": material, **coating(block)}
         sizing = block.stop and not pupil
         aperture, clips = read_apertures(block.lines, block.factor, block.place, sizing)
         if block.stop and not aperture.get("clips", True):
@@ -380,4 +389,4 @@ def _is_ignored(lines: Block) -> bool:
 def _is_dummy(row: Row, before: str | None) -> bool:
     """Return whether a row is a plane between one medium and the same."""
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
-    return flat and "phase" not in row and row["material"] == before
+    return flat and row.keys().isdisjoint(("phase", "coating")) and row["material"] == before

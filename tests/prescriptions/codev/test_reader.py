@@ -15,6 +15,14 @@ def prescription(*surfaces, **parts):
     return read_codev(system(*surfaces, **parts), "lens").prescription
 
 
+def test_coatings_in_files_of_their_own_are_listed():
+    text = TRIPLET.replace("GO\n", "MLT S2 'ar.mul'\nGO\n")
+    assert text != TRIPLET
+    found = read_codev(text, "lens")
+    assert "coatings, whose .mul files are not read (MLT)" in found.passed_over
+    assert found.prescription == read_codev(TRIPLET, "lens").prescription
+
+
 def test_what_a_file_says_of_its_system():
     found, passed_over = read_codev(TRIPLET, "lens")
     assert passed_over == ["variables, couplings and limits of an optimization (CCY, THC)"]
