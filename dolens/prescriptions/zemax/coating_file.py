@@ -95,7 +95,7 @@ def parse_coatings(text: str, path: Path) -> CoatingFile:
 
 
 class Read(NamedTuple):
-    """What a coating of a file is in a prescription.
+    """A `Read` coating is what one of a file is in a prescription.
 
     Attributes:
         layers: of a stack, from the outermost to the substrate; None of others.
