@@ -69,7 +69,7 @@ _VIEWS = (
         "summary",
         "wavefront",
     ),
-    "zernike",
+    *("with_iris", "zernike"),
 )
 LENS_METHODS.update(dict.fromkeys(_VIEWS, "dolens.views.LensViews"))
 # What needs a part that nothing below it imports.

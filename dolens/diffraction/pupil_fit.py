@@ -273,7 +273,7 @@ def with_differentiable_bounds(fit: PupilFit) -> PupilFit:
     if not edges or not moving or not torch.is_grad_enabled():
         return fit
     place, which, slope = _ends(fit)
-    depth = _depths(fit, place).gather(1, which[:, None])[:, 0]
+    depth = edge_depths(fit, place).gather(1, which[:, None])[:, 0]
     inverse = torch.where(slope.abs() > _TINY, 1.0 / slope, 0.0)
     first, last = ((depth.detach() - depth) * inverse).unflatten(1, (2, 2)).unbind(1)
     start, end = torch.stack((place[:, :2], place[:, 2:])).diagonal(dim1=2, dim2=3)
@@ -295,7 +295,7 @@ def _ends(fit: PupilFit) -> tuple[Tensor, Tensor, Tensor]:
     share = torch.stack(torch.meshgrid(step, step, indexing="ij"), -1).reshape(-1, 2)
     width = fit.high - fit.low
     grid = fit.low[:, None] + width[:, None] * share
-    depth = _depths(fit, grid).amin(1)
+    depth = edge_depths(fit, grid).amin(1)
     starts = []
     for axis, sign in ((0, -1.0), (1, -1.0), (0, 1.0), (1, 1.0)):
         # The farthest row with light, and in it the point deepest in the light.
@@ -322,14 +322,15 @@ def _ends(fit: PupilFit) -> tuple[Tensor, Tensor, Tensor]:
 
 def _along(fit: PupilFit, place: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Distance (N, 4) inside the nearest edge, its slope by cosine, and whose edge it is."""
-    depth, which = _depths(fit, place).min(1)
+    depth, which = edge_depths(fit, place).min(1)
     ahead, behind = (
-        _depths(fit, place + sign * reach).gather(1, which[:, None])[:, 0] for sign in (1.0, -1.0)
+        edge_depths(fit, place + sign * reach).gather(1, which[:, None])[:, 0]
+        for sign in (1.0, -1.0)
     )
     return depth, (ahead - behind) / (2.0 * reach.sum(-1)), which
 
 
-def _depths(fit: PupilFit, cosines: Tensor) -> Tensor:
+def edge_depths(fit: PupilFit, cosines: Tensor) -> Tensor:
     """Return distances inside the clipping edges (N, surfaces, M), mm, at cosines (N, M, 2)."""
     unit = (cosines - fit.centre[:, None]) / fit.half_width[:, None]
     degree = fit.coefficients.shape[-1] - 1

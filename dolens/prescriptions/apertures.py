@@ -12,6 +12,10 @@ blocked, by one outline or by a list of them, each with a centre of its own::
     '6': {type: plane, aperture: {polygons: [[[-4, -3], [4, -3], [0, 5]]]}, ...}
     '7': {type: plane, semi_diameter: 100, obscuration: [{semi_diameter: 34},
           {width: 2, arms: 4, angle: 45}, {inner_semi_diameter: 60, semi_diameter: 62}], ...}
+    '8': {type: plane, aperture: {blades: 7, semi_diameter: 5.0, angle: 10}, ...}
+
+`blades` are those of an iris: a regular polygon whose corners lie on a circle, the first at an
+`angle` (degrees from +x towards +y).  It is written as `polygons`.
 
 `polygons` are lists of vertices [x, y] (mm): light passes inside each of them, and one inside
 another is a hole.  A spider has `arms` of a `width` (mm), the first at an `angle` (degrees from +x
@@ -26,6 +30,7 @@ paraxial one: where fewer than half of a field's rays get through, rays are aime
 stop instead.  Where no ray gets through at all, the height is the paraxial one.
 """
 
+import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -37,6 +42,7 @@ from torch import Tensor
 from dolens.errors import InputError, check_keys
 from dolens.optics.aiming import aim
 from dolens.optics.elements import from_lens_axes
+from dolens.optics.field_and_aperture import with_aperture
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
@@ -64,19 +70,21 @@ AUTOMATIC = "auto"
 _MOST_PARTS = 1000
 # Stands for an automatic semi-diameter (mm) until the light of the fields is known.
 _NOT_YET_KNOWN = 1.0
+_BLADES: Any = Polygons.of_blades
 # Keys of an outline, all of them necessary, and what is made of their numbers.
-_OUTLINES: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
+_OUTLINES: tuple[tuple[tuple[str, ...], Any], ...] = (
     (("semi_diameter",), Circle),
     (("half_width_x", "half_width_y"), Rectangle),
     (("semi_axis_x", "semi_axis_y"), Ellipse),
     (("polygons",), Polygons),
+    (("blades", "semi_diameter"), _BLADES),
 )
-_BLOCKING: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
+_BLOCKING: tuple[tuple[tuple[str, ...], Any], ...] = (
     (("inner_semi_diameter", "semi_diameter"), Ring),
     *_OUTLINES,
     (("width", "arms"), Spider),
 )
-_OPTIONAL: dict[Any, tuple[str, ...]] = {Spider: ("angle",)}
+_OPTIONAL: dict[Any, tuple[str, ...]] = {Spider: ("angle",), _BLADES: ("angle",)}
 _CENTER = ("decenter_x", "decenter_y")
 # Points of the pupil's rim.
 _RIM = 16
@@ -199,18 +207,18 @@ def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float
 
 
 def _outline(
-    value: Any, outlines: tuple[tuple[tuple[str, ...], type[Outline]], ...], place: str
+    value: Any, outlines: tuple[tuple[tuple[str, ...], Any], ...], place: str
 ) -> tuple[Outline, tuple[float, float]]:
     """Return an outline, one of some kinds, and the centre of it."""
     require_mapping(value, place)
-    optional = [key for keys in _OPTIONAL.values() for key in keys if outlines is _BLOCKING]
+    optional = [key for _, make in outlines for key in _OPTIONAL.get(make, ())]
     known = dict.fromkeys((*(key for keys, _ in outlines for key in keys), *optional, *_CENTER))
     check_keys(value, tuple(known), place)
     x, y = (as_number(value.get(key, 0.0), f"{place}: '{key}'") for key in _CENTER)
     given = [entry for entry in outlines if any(key in value for key in entry[0])]
-    if len(given) > 1 and given[0][1] is Ring and "inner_semi_diameter" not in value:
-        given = given[1:]
-    elif given and given[0][1] is Ring:
+    # A ring and an iris have a semi-diameter, too: their first key tells them from a circle.
+    given = [(k, make) for k, make in given if k[0] in value or "semi_diameter" not in k]
+    if any("semi_diameter" in k[1:] for k, _ in given):
         given = [entry for entry in given if entry[1] is not Circle]
     if len(given) != 1:
         kinds = dict.fromkeys(" and ".join(keys) for keys, _ in outlines)
@@ -249,6 +257,28 @@ def _vertices(value: object, place: str) -> tuple[tuple[tuple[float, float], ...
     if not polygons:
         raise InputError(f"{place}: must be a list of lists of vertices [x, y] (mm)")
     return tuple(tuple((x, y) for x, y in polygon) for polygon in polygons)
+
+
+def with_iris(lens: Lens, blades: int, angle: float = 0.0, f_number: float | None = None) -> Lens:
+    """Return a copy of a lens whose stop has an iris of straight blades, their corners on its
+    circle.
+
+    Args:
+        lens: it stays as it is.
+        blades: how many, 3 to 100.
+        angle: of the first corner, degrees from +x towards +y.
+        f_number: of the circle; None: as it is.
+
+    Raises:
+        InputError: a number out of range, or a stop that is no circle.
+    """
+    found = copy.deepcopy(with_aperture(lens, f_number))
+    stop = found.surfaces[str(found.stop)]
+    if not isinstance(stop.aperture.edge, Circle) or stop.aperture.window is not None:
+        raise InputError(f"lens '{lens.name}': an iris needs a stop whose edge is a circle")
+    window = Polygons.of_blades(blades, stop.aperture.semi_diameter, angle)
+    stop.aperture = replace(stop.aperture, window=window)
+    return found
 
 
 @torch.no_grad()

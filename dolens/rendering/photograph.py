@@ -164,11 +164,13 @@ class StrayLight:
         lens: the camera's.
         lights: in the picture.
         sensor_reflectance: share of the light that the sensor reflects.
+        diffraction: whether lights have it where it shows.
     """
 
     lens: Lens
     lights: tuple[Light, ...]
     sensor_reflectance: float = 0.0
+    diffraction: bool = True
 
     @torch.no_grad()
     def added_to(self, image: Tensor, imaging: ImagingSystem, plane: int) -> Tensor:
@@ -180,7 +182,12 @@ class StrayLight:
         whole = image + glare * image.mean((-2, -1), keepdim=True)
         if not self.lights:
             return whole
-        found = light_on_sensor(*given, self.lights, sensor_reflectance=self.sensor_reflectance)
+        found = light_on_sensor(
+            *given,
+            self.lights,
+            sensor_reflectance=self.sensor_reflectance,
+            diffraction=self.diffraction,
+        )
         return whole + found.to(image)
 
 

@@ -26,6 +26,7 @@ from dolens.kernels import rendering
 from dolens.optics.field_and_aperture import in_double_precision
 from dolens.optics.lens import Lens
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.starburst import Starburst, bands, starburst
 from dolens.scene.scene import bilinear
 from dolens.sensor.pixels import Sensor
 
@@ -59,6 +60,7 @@ def light_on_sensor(
     lights: Sequence[Light],
     rays: int = 20_000,
     sensor_reflectance: float = 0.0,
+    diffraction: bool = True,
 ) -> Tensor:
     """Return the image and the ghosts of lights, (C, height, width), in shares of white.
 
@@ -72,6 +74,8 @@ def light_on_sensor(
         lights: at most as many as patience allows: each takes rays along all paths.
         rays: of each light, path and wavelength.
         sensor_reflectance: share of the light that the sensor reflects.
+        diffraction: whether the lights' own images have it where it shows; see
+            `dolens.rendering.starburst`.
 
     Raises:
         InputError: as `dolens.analysis.ghosts.ghosts` does.
@@ -81,8 +85,12 @@ def light_on_sensor(
     depth, scale = scene.depths[plane], scene.magnifications(system)[plane]
     paths = chosen_paths(lens, 2, sensor_reflectance > 0.0, None)
     white = math.pi * _axial_aperture(imaging)
+    shape = (sensor.height, sensor.width)
     channels = []
-    for channel, wavelength in enumerate(scene.wavelengths):
+    for channel, (wavelength, band) in enumerate(
+        zip(scene.wavelengths, bands(scene.wavelengths), strict=True)
+    ):
+        found = torch.zeros(shape, dtype=torch.float64, device=lens.device)
         grids: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = defaultdict(list)
         for light in lights:
             x, y = _object_point(light, sensor, scale)
@@ -95,13 +103,53 @@ def light_on_sensor(
                 if part.path == ENTERING or not len(part.light):
                     continue
                 rows, columns = sensor.pixels(*part.points.unbind(-1))
+                arriving = factor * part.light
+                if part.path == IMAGE and diffraction:
+                    power = arriving.sum()
+                    given = (
+                        system,
+                        sensor,
+                        (x, y, -depth),
+                        wavelength,
+                        band,
+                        float(power.detach()),
+                    )
+                    star = starburst(*given)
+                    if star is not None:
+                        found = found + power * _with_starburst(
+                            rows, columns, arriving, star, shape
+                        )
+                        continue
                 cell = 1 if part.path == IMAGE else _cell(rows, columns)
-                grids[cell].append((rows, columns, factor * part.light))
-        shape = (sensor.height, sensor.width)
-        found = [_on_pixels(cell, parts, shape) for cell, parts in grids.items()]
-        zero = torch.zeros(shape, dtype=torch.float64, device=lens.device)
-        channels.append(sum(found, zero))
+                grids[cell].append((rows, columns, arriving))
+        channels.append(sum((_on_pixels(*grid, shape) for grid in grids.items()), found))
     return torch.stack(channels)
+
+
+def _with_starburst(
+    rows: Tensor, columns: Tensor, light: Tensor, star: Starburst, shape: tuple[int, int]
+) -> Tensor:
+    """Return the image (height, width) of a light of unit power: of its rays and its edge."""
+    image = _on_pixels(1, [(star.rows, star.columns, star.light)], shape)
+    if star.window is None:
+        kept = (1.0 - star.beyond) * light / light.sum()
+        return image + _on_pixels(1, [(rows, columns, kept)], shape)
+    size = len(star.window)
+    (top, left), (height, width) = star.corner, shape
+    inside = [
+        slice(max(first, 0), min(first + size, side))
+        for first, side in ((top, height), (left, width))
+    ]
+    if any(part.start >= part.stop for part in inside):
+        return image
+    down, across = inside
+    window = star.window[
+        down.start - top : down.stop - top, across.start - left : across.stop - left
+    ]
+    near = torch.zeros_like(image, dtype=torch.bool)
+    near[down, across] = True
+    edges = (across.start, width - across.stop, down.start, height - down.stop)
+    return torch.where(near, torch.nn.functional.pad(window, edges), image)
 
 
 def _axial_aperture(imaging: ImagingSystem) -> float:

@@ -14,11 +14,28 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
+    from dolens.optics.lens import Lens
     from dolens.rendering.photograph import Photograph
 
 
 class PhotographViews:
-    """The method of `Lens` that photographs."""
+    """Methods of `Lens` that photograph."""
+
+    def with_iris(self, blades: int, angle: float = 0.0, f_number: float | None = None) -> Lens:
+        """Return a copy of this lens whose stop has an iris of straight blades, their corners on
+        its circle.
+
+        Args:
+            blades: how many, 3 to 100.
+            angle: of the first corner, degrees from +x towards +y.
+            f_number: of the circle; None: as it is.
+
+        Raises:
+            InputError: a number out of range, or a stop that is no circle.
+        """
+        from dolens.prescriptions.apertures import with_iris
+
+        return with_iris(as_lens(self), blades, angle, f_number)
 
     def photograph(
         self,
@@ -72,8 +89,9 @@ class PhotographViews:
             seed: of the noise.
             lights: points that are brighter than white by far, each a row and a column of the
                 picture and its power over that of a white pixel, one number or three; with their
-                ghosts, and the veil of the scene's own (see `dolens.rendering.stray_light`).  An
-                empty list: the veil alone; None: no stray light.
+                starbursts where these show and `diffraction` is not `none`, with their ghosts, and
+                the veil of the scene's own (see `dolens.rendering.stray_light`).  An empty list:
+                the veil alone; None: no stray light.
             sensor_reflectance: share of the light that the sensor reflects, for ghosts.
 
         Returns:
@@ -108,5 +126,7 @@ class PhotographViews:
                 "sensor_reflectance", sensor_reflectance, 1.0, "of the light", from_zero=True
             )
             found = tuple(lights_of(lights, (height, width), pixels))
-            camera = replace(camera, stray_light=StrayLight(lens, found, share))
+            camera = replace(
+                camera, stray_light=StrayLight(lens, found, share, diffraction != "none")
+            )
         return next(camera.photographs(linear, seed))

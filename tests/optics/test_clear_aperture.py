@@ -6,7 +6,7 @@ import pytest
 import torch
 from matplotlib.path import Path as Outline
 
-from dolens import InputError, Rays, Status
+from dolens import InputError, Rays, Status, load_lens
 from dolens.diffraction.wavefront import coverage
 from dolens.optics.thermal_lens import lens_at
 from dolens.prescriptions import lens_from_prescription, prescription_of
@@ -246,3 +246,38 @@ def test_an_obscuration_blocks_the_middle_and_its_own_edge():
 def test_bad_apertures_are_one_clear_line(aperture, message):
     with pytest.raises(InputError, match=message):
         lens_from_prescription(window(**aperture))
+
+
+def test_blades_make_a_regular_polygon():
+    points, turn = cloud(), math.radians(20.0)
+    corners = [
+        [4.0 * math.cos(turn + k * 0.4 * math.pi), 4.0 * math.sin(turn + k * 0.4 * math.pi)]
+        for k in range(5)
+    ]
+    given = window(aperture={"blades": 5, "semi_diameter": 4.0, "angle": 20.0})
+    inside = torch.from_numpy(Outline([*corners, corners[0]]).contains_points(points))
+    assert torch.equal(passes(given, points), inside)
+    written = prescription_of(lens_from_prescription(given))["surfaces"]["1"]["aperture"]
+    assert torch.equal(passes(window(aperture=written), points), inside)
+
+
+def test_an_iris_has_its_corners_on_the_stop_s_circle():
+    lens = load_lens("cooke_triplet").with_iris(6, f_number=8)
+    stop = lens.surfaces[str(lens.stop)].aperture
+    assert stop.window.semi_diameter == pytest.approx(stop.edge.semi_diameter, rel=1e-12)
+    assert float(lens.first_order(550).f_number) == pytest.approx(8.0, rel=3e-3)
+    with pytest.raises(InputError, match="an iris needs a stop whose edge is a circle"):
+        lens.with_iris(6)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"blades": 2, "semi_diameter": 4}, "'blades' must be a whole number from 3 to 100, not 2"),
+        ({"blades": 5}, "'aperture': 'semi_diameter' is missing"),
+        ({"semi_diameter": 4, "half_width_x": 4}, "'aperture': give one of semi_diameter, half"),
+    ],
+)
+def test_what_is_no_iris_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        lens_from_prescription(window(aperture=given))

@@ -9,6 +9,7 @@ from dolens import InputError, load_lens
 from dolens.analysis.conditions import conditions
 from dolens.analysis.ghosts import ghosts
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.starburst import bands, starburst
 from dolens.rendering.stray_light import Light, light_on_sensor, lights_of, veil
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -91,6 +92,76 @@ def test_a_photograph_has_its_lights(bare):
     assert divmod(int(lit.signal[1].argmax()), 60) == (10, 45)
     # Its ghosts are seen far from it.
     assert float((lit.signal - veiled.signal)[:, 20:, :30].amax()) > 0.01
+
+
+@pytest.fixture(scope="module")
+def starry():
+    """A triplet at f/8 with six blades before pixels of two fringes, and a light of 10⁵."""
+    lens = load_lens("cooke_triplet").with_iris(6, f_number=8).requires_grad_(False)
+    fine = ImagingSystem.of(lens.system(), PlanarScene((FAR,), (GREEN,)), Sensor(81, 101, 0.009))
+    return lens, fine
+
+
+def test_a_starburst_moves_light_and_takes_none(starry):
+    lens, fine = starry
+    plain, star = (
+        light_on_sensor(lens, fine, 0, [light(40, 50, 1e5)], rays=2000, diffraction=d)[0]
+        for d in (False, True)
+    )
+    # What leaves the sensor: 2λN/(π²r) of a round stop, beyond 0.4 mm.
+    assert float(star.sum() / plain.sum()) == pytest.approx(1.0, abs=5e-3)
+    near = (slice(35, 46), slice(45, 56))
+    assert float((plain[near].sum() - star[near].sum()) / plain.sum()) > 0.02
+
+
+def test_waves_near_the_light_meet_the_edge_s_light_farther_out(starry):
+    """The next ring of pixels outside of the window is as bright as its last, but for 1/r²."""
+    lens, fine = starry
+    star = starburst(lens.system(), fine.sensor, (0.0, 0.0, -FAR), GREEN, (537.0, 563.0), 1e5)
+    size, outside = len(star.window), (star.rows - 40.0).abs().maximum((star.columns - 50.0).abs())
+    half = size // 2
+    ring = (outside > half + 0.5) & (outside < half + 1.5)
+    last = float(star.window.sum() - star.window[1:-1, 1:-1].sum())
+    fallen = (half / (half + 1.0)) ** 2
+    assert float(star.light[ring].sum()) == pytest.approx(last * fallen, rel=0.05)
+    assert float(star.window.sum() + star.light[outside > half + 0.5].sum()) == pytest.approx(
+        1.0, abs=0.01
+    )
+
+
+def test_where_no_starburst_shows_nothing_changes(starry, caplog):
+    lens, fine = starry
+    caplog.set_level("INFO")
+    both = [
+        light_on_sensor(lens, fine, 0, [light(40, 50, 0.02)], rays=100, diffraction=d)
+        for d in (False, True)
+    ]
+    assert torch.equal(*both)
+    assert "starburst: left out: 0." in caplog.text
+
+
+def test_a_colour_goes_half_way_to_the_next():
+    assert bands((656.0, 588.0, 486.0)) == [(622.0, 690.0), (537.0, 622.0), (435.0, 537.0)]
+    assert bands((550.0,)) == [(550.0, 550.0)]
+
+
+def test_the_derivative_of_a_starburst_is_that_of_its_number(starry):
+    lens, fine = starry
+    name = "sensor_distance"
+    at = dict(lens.named_parameters())[name].detach()
+    away = torch.hypot(
+        *torch.meshgrid(torch.arange(-40.0, 41.0), torch.arange(-50.0, 51.0), indexing="ij")
+    )
+
+    def spread(value):
+        given = lens.with_values({name: value})
+        image = light_on_sensor(given, fine, 0, [light(40, 50, 1e5)], rays=100)[0]
+        return (image * away).sum()
+
+    value = at.clone().requires_grad_()
+    slope = float(torch.autograd.grad(spread(value), value)[0])
+    around = [float(spread(at + step)) for step in (0.02, -0.02)]
+    assert slope == pytest.approx((around[0] - around[1]) / 0.04, rel=0.03)
 
 
 def test_lights_are_named_by_pixels_of_the_picture():

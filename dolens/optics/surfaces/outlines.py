@@ -127,6 +127,27 @@ class Polygons(Composite):
             if not all(math.isfinite(value) for vertex in polygon for value in vertex):
                 raise InputError("a polygon's vertices must be finite (mm)")
 
+    @classmethod
+    def of_blades(cls, blades: float, semi_diameter: float, angle: float = 0.0) -> "Polygons":
+        """Return the opening of an iris: a regular polygon with its corners on a circle.
+
+        Args:
+            blades: how many sides.
+            semi_diameter: of the circle, mm.
+            angle: of the first corner, degrees from +x towards +y.
+
+        Raises:
+            InputError: fewer than three blades or too many, or a number that is not finite.
+        """
+        if blades != int(blades) or not 3 <= blades <= 100:
+            raise InputError(f"'blades' must be a whole number from 3 to 100, not {blades:g}")
+        require_length("'semi_diameter'", semi_diameter)
+        if not math.isfinite(angle):
+            raise InputError(f"'angle' must be finite, not {angle}")
+        turns = [math.radians(angle) + 2.0 * math.pi * k / blades for k in range(int(blades))]
+        corners = [(semi_diameter * math.cos(t), semi_diameter * math.sin(t)) for t in turns]
+        return cls((tuple(corners),))
+
     @property
     def sides(self) -> list[tuple[Point, Point]]:
         """Return all sides, from vertex to vertex."""
