@@ -46,6 +46,7 @@ _PACKAGES = (
 _VIEWS = (
     *(
         "coated",
+        "crystal_rays",
         "draw",
         "encircled_energy",
         "explain",

@@ -13,6 +13,7 @@ from dolens.diffraction.propagation import fourier_field
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
+from dolens.optics.crystals import Uniaxial
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
 from dolens.sensor.pixels import Sensor
@@ -87,12 +88,19 @@ class Unmodelled:
                 if curvature is not None:
                     curvature.div_(1.0 + self.radius * share)
         shifted = {
-            glass: ShiftedMedium(glass, self.index * share)
+            glass: shifted_medium(glass, self.index * share)
             for glass, share in zip(glasses, melts.tolist(), strict=True)
         }
         media: list[Any] = [shifted.get(medium, medium) for medium in lens.materials]
         found.materials = tuple(media)
         return found
+
+
+def shifted_medium(medium: Medium, shift: float) -> Any:
+    """Return a medium whose index is larger by a number, of a crystal both indices."""
+    if isinstance(medium, Uniaxial):
+        return medium.of(lambda own: ShiftedMedium(own, shift))
+    return ShiftedMedium(medium, shift)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.state import SurfaceState
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_isotropic
 
 Path = tuple[int, ...]
 # Paths of many reflections are too many to count.
@@ -192,6 +192,7 @@ def ghost_path_systems(
         paths: as `ghost_paths` gives them.
         sensor: what a sensor that reflects catches of the light.
     """
+    require_isotropic(system, "ghosts")
     onto_sensor = system.image
     if onto_sensor is None:
         onto_sensor = SurfaceState(Plane, {}, sensor)
@@ -266,6 +267,7 @@ def with_losses(system: OpticalSystem) -> OpticalSystem:
     """Return the lens with bare glass where a surface has no coating: an ideal one, which passes
     all light, makes no ghosts.
     """
+    require_isotropic(system, "ghosts")
     surfaces = [
         replace(surface, coating=Stack())
         if surface.coating is None and _reflects(system, number)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError, check_choice
 from dolens.optics import LENS_METHODS
+from dolens.optics.crystals import Uniaxial
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
@@ -57,6 +58,7 @@ def check_lens(
     for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
         if surface.law is not None and medium is MIRROR:
             raise InputError(f"surface {number}: a {surface.law.kind} cannot be a mirror")
+    check_crystals(surfaces, media)
     check_elements(elements, count)
     if all(surface.changes_axes for surface in surfaces):
         raise InputError("there is no surface but coordinate breaks")
@@ -68,6 +70,29 @@ def check_lens(
             raise InputError(f"{place}, and cannot be the stop")
         if media[number] != media[number - 1]:
             raise InputError(f"{place}; the medium behind it is the one in front of it")
+
+
+def check_crystals(surfaces: Sequence[Surface], media: Sequence[Medium]) -> None:
+    """Raise `InputError` where a crystal holds the object or the sensor, or has a face with a law
+    or a coating: crystals are plates, prisms and lenses with ideal faces.
+
+    Args:
+        surfaces: of the lens.
+        media: before surface 1 and behind each surface.
+    """
+    for name, medium in (("object", media[0]), ("sensor", media[-1])):
+        if isinstance(medium, Uniaxial):
+            raise InputError(f"the {name} cannot be in a crystal ({medium.name})")
+    for number, surface in enumerate(surfaces, 1):
+        if not any(isinstance(medium, Uniaxial) for medium in media[number - 1 : number + 1]):
+            continue
+        held = "coating" if surface.coating is not None else None
+        if surface.law is not None or surface.phase is not None:
+            held = "phase or law of its own"
+        if held is not None:
+            raise InputError(
+                f"surface {number}: the face of a crystal is ideal, and cannot have a {held}"
+            )
 
 
 class Lens(LensRays, InStates, nn.Module):

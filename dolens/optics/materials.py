@@ -8,11 +8,12 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, comma_hint
+from dolens.optics.crystals import RAYS, Uniaxial, unit_axis
 from dolens.optics.dispersion import ModelGlass, model_glass, require_wavelength
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.glass_catalog import find_glass
@@ -112,6 +113,9 @@ _DECIMAL = r"\s*(\d+(?:\.\d+)?)\s*"
 _SIGNED = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*"
 _GLASS = re.compile(f"{_DECIMAL}/{_DECIMAL}(?:/{_SIGNED})?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
+_CRYSTAL = re.compile(
+    rf"(?P<medium>\S.*?)\s+(?P<ray>{'|'.join(RAYS)})\b(?P<axis>.*)", re.IGNORECASE | re.DOTALL
+)
 # No optical medium is denser; the bound also catches a wavelength or a glass code.  Vacuum has
 # 0.9997 relative to air, and some crystals in the infrared have less than 1.
 _LOWEST_INDEX, _HIGHEST_INDEX = 0.1, 10.0
@@ -144,7 +148,7 @@ class Material:
 
 # What light may travel through: hashable, equal when it is the same medium, and with a name that a
 # prescription reads back as the same.
-Medium = Material | ModelGlass | Glass | Mirror
+Medium = Material | ModelGlass | Glass | Mirror | Uniaxial
 
 # Names of what stands for a medium and is none but air.
 NO_GLASS = ("air", "occluder", MIRROR.name)
@@ -162,8 +166,11 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
     Args:
         text: `air`; `occluder`; `mirror`, where a surface reflects; a number, the same index at
             every wavelength; glass as nd/Vd, for example `1.5168/64.17`, or as nd/Vd/ΔPgF (see
-            `model_glass`); or a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7` (see
-            `find_glass`).  Case is ignored.
+            `model_glass`); a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7` (see
+            `find_glass`); or a uniaxial crystal, for example `CALCITE extraordinary 0 1 1` (see
+            `Uniaxial`): the medium of its ordinary rays, which ray is followed, and the direction
+            of its optic axis.  The medium of extraordinary rays has the name with `-E` behind it,
+            or stands behind `and`: `1.658 and 1.486 ordinary 0 1 0`.  Case is ignored.
         model: which lines nd and Vd stand for, and the index of air.  A constant index, nd/Vd and
             nd/Vd/ΔPgF are taken as written; a catalogue glass is relative to air (see `Glass`).
         environment: temperature and pressure of a catalogue glass; None: those of its catalogue.
@@ -177,6 +184,9 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
             `find_glass`), or the number is not from 0.1 to 10, or nd is not, or Vd is not positive.
     """
     name = str(text).strip()
+    crystal = _CRYSTAL.fullmatch(name)
+    if crystal is not None:
+        return _crystal(crystal, model, environment)
     if name.lower() == "air":
         return Material("air", model.air)
     if name.lower() == "occluder":
@@ -203,9 +213,17 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
 def absorption(medium: Medium, wavelength: float | Tensor) -> float | Tensor:
     """Return how fast light is absorbed in a medium, 1/mm: I = I₀·exp(-a·t), at wavelengths in nm.
 
-    It is zero where no catalogue gives an internal transmittance.
+    It is zero where no catalogue gives an internal transmittance.  Of a crystal it is that of the
+    ray that is followed.
     """
+    if isinstance(medium, Uniaxial):
+        medium = medium.followed
     return medium.absorption(wavelength) if isinstance(medium, Glass) else 0.0
+
+
+def is_anisotropic(medium: Medium) -> TypeGuard[Uniaxial]:
+    """Return whether light goes through a medium as extraordinary rays."""
+    return isinstance(medium, Uniaxial) and medium.anisotropic
 
 
 def is_glass(medium: Medium) -> bool:
@@ -222,6 +240,44 @@ def abbe_number(medium: Medium) -> float:
     """Vd = (nd - 1)/(nF - nC) at 587.5618, 486.1327 and 656.2725 nm; inf without dispersion."""
     dispersion = float(medium.index(LINE_F)) - float(medium.index(LINE_C))
     return math.inf if dispersion == 0.0 else (index_d(medium) - 1.0) / dispersion
+
+
+def _crystal(found: re.Match[str], model: IndexModel, environment: Environment | None) -> Uniaxial:
+    text, ray, components = found[0], found["ray"].lower(), found["axis"].split()
+    first, both, second = found["medium"].partition(" and ")
+    try:
+        x, y, z = map(float, components)
+        axis = unit_axis((x, y, z))
+    except ValueError:
+        raise InputError(
+            f"material '{text}': behind '{ray}' stand the three numbers of the optic axis, which "
+            "are not all zero"
+        ) from None
+    media: list[Medium] = []
+    if not both:
+        # Catalogues that have the one ray alone are passed over.
+        second = f"{first}-E"
+        maker, _, _ = _part_of(text, second, model, environment).name.rpartition(":")
+        first = f"{maker}:{first}" if maker and ":" not in first else first
+    for part in (first, second):
+        media.append(_part_of(text, part, model, environment))
+    ordinary, extraordinary = media
+    name = ordinary.name
+    if extraordinary.name != f"{name}-E":
+        name = f"{name} and {extraordinary.name}"
+    return Uniaxial(f"{name} {ray} {' '.join(components)}", ordinary, extraordinary, axis, ray)
+
+
+def _part_of(
+    text: str, part: str, model: IndexModel, environment: Environment | None
+) -> Material | ModelGlass | Glass:
+    try:
+        found = parse_material(part, model, environment)
+    except InputError as error:
+        raise InputError(f"material '{text}': {error}") from None
+    if isinstance(found, Mirror | Uniaxial):
+        raise InputError(f"material '{text}': '{part}' is no medium with one index")
+    return found
 
 
 def _with_partial_dispersion(

@@ -183,6 +183,8 @@ Wavelength = float | Sequence[float] | Tensor
 
 def unsupported(system: OpticalSystem) -> str | None:
     """Say why the kernels cannot trace a lens, naming the surface; None where they can."""
+    if system.anisotropic:
+        return f"medium {system.anisotropic[0]} is a crystal of extraordinary rays"
     device = system.device.type
     if not any(_lacks_kernel(shape, law, device) for shape, law in system.kinds):
         return None

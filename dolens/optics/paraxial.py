@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.materials import is_anisotropic
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
 
@@ -337,7 +338,11 @@ def curvatures_of(
 def powers_of(
     system: OpticalSystem, wavelength: float | Tensor, first: int = 1, last: int | None = None
 ) -> list[Tensor | float] | None:
-    """Return the powers (1/mm) that phases and ideal lenses add to surfaces `first` to `last`.
+    """Return the powers (1/mm) that phases, ideal lenses and crystals add to surfaces `first` to
+    `last`.
+
+    Extraordinary rays see another index at the face of their crystal than in it, see
+    `Uniaxial.axial_index`: its difference times the curvature is added here.
 
     Args:
         system: the lens.
@@ -349,7 +354,9 @@ def powers_of(
         One power a surface, or None where none adds any: the mean over azimuth, or that along the
         system's meridian.
     """
-    if not deflects(system.surfaces[first - 1 : last]):
+    media = system.materials[first - 1 : None if last is None else last + 1]
+    crystals = any(map(is_anisotropic, media))
+    if not (crystals or deflects(system.surfaces[first - 1 : last])):
         return None
     found: list[Tensor | float] = []
     for number, surface in _numbered(system, first, last):
@@ -361,6 +368,15 @@ def powers_of(
         else:
             way = _direction(system, number)
             found.append(own.law.section_power(own.parameters, *way).at(wavelength))
+    if crystals:
+        indices, senses = system.indices(wavelength), system.senses
+        shifts = [
+            sense * (medium.axial_index(wavelength) - index) if is_anisotropic(medium) else 0.0
+            for medium, index, sense in zip(system.materials, indices, senses, strict=True)
+        ]
+        for place, curvature in enumerate(curvatures_of(system, first, last)):
+            step = shifts[first + place] - shifts[first + place - 1]
+            found[place] = found[place] + step * curvature
     return found
 
 

@@ -6,13 +6,14 @@ tells from which side light comes behind coordinate breaks.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, change_axes
-from dolens.optics.materials import Medium
+from dolens.optics.materials import Medium, is_anisotropic
 from dolens.optics.paraxial import (
     TwoRays,
     behind_surfaces,
@@ -235,15 +236,29 @@ class ParaxialNumbers:
 
     def _unit_rays_behind(self, wavelength: float, first: int, last: int) -> TwoRays:
         """Trace the unit rays from just before surface `first` to just after `last`."""
-        powers = None
+        powers, curvatures = None, self.curvatures[first - 1 : last]
         if self.powers is not None:
             powers = [constant + k * wavelength for constant, k in self.powers[first - 1 : last]]
+        media = range(first - 1, last + 1)
+        shifts = [self._shift(medium, wavelength) for medium in media]
+        if any(shifts):
+            steps = (b - a for a, b in pairwise(shifts))
+            own = powers or [0.0] * len(curvatures)
+            powers = [p + s * c for p, s, c in zip(own, steps, curvatures, strict=True)]
         return behind_surfaces(
-            self.curvatures[first - 1 : last],
+            curvatures,
             self.thicknesses[first - 1 : max(last - 1, 0)],
-            [self._index(medium, wavelength) for medium in range(first - 1, last + 1)],
+            [self._index(medium, wavelength) for medium in media],
             powers,
         )
+
+    def _shift(self, medium: int, wavelength: float) -> float:
+        """Return how much larger a crystal's index is at its faces; see `powers_of`."""
+        crystal: Any = self.materials[medium]
+        if not is_anisotropic(crystal):
+            return 0.0
+        difference = crystal.axial_index(wavelength) - crystal.index(wavelength)
+        return self.senses[medium] * float(difference)
 
     def _index(self, medium: int, wavelength: float) -> Number:
         """Return a medium's index, negative where light travels towards -z."""

@@ -23,6 +23,11 @@ square's order.  The product J of these is what polarises; the turn of the axes 
 
     P = (u₁', u₂', k')·[[J, 0], [0, 1]]·(u₁, u₂, k)ᵀ.
 
+A crystal passes the field of the ray that is followed: t_s = 0, and w = (a·u₁, a·u₂) of an
+extraordinary ray or (a·u₂, -a·u₁) of an ordinary one, a the optic axis, with 1/|w|² for t_p - t_s.
+In it k is along the wave vector, not along the ray, and the field is that of D.  Its faces are
+ideal: they reflect nothing, and what is not of the ray that is followed goes the other way.
+
 Fields are roots of power: t stands for t·√(n'·cos θ'/(n·cos θ)), so that ½·tr(J†J) is the share of
 unpolarised light that arrives.  Time goes as exp(-iωt); the phase of the path is left out.
 """
@@ -30,12 +35,15 @@ unpolarised light that arrives.  Time goes as exp(-iωt); the phase of the path 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.optics.coatings import CoatingState, Stack
+from dolens.optics.crystals import Crystal, Uniaxial
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.materials import is_anisotropic
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.surfaces.deflection import Vector
 from dolens.optics.system import OpticalSystem
@@ -204,7 +212,8 @@ class _Field:
     def _cross(self, crossing: Crossing) -> None:
         number = crossing.number
         surface, mirror = self.system.surfaces[number - 1], number in self.system.mirrors
-        refracts = surface.deflection is not None or self.system.refracts(number)
+        crystal = isinstance(self.system.materials[number], Uniaxial)
+        refracts = surface.deflection is not None or crystal or self.system.refracts(number)
         if surface.coating is None and not refracts:
             return
         u, v, k = self.behind
@@ -221,12 +230,25 @@ class _Field:
             self.flux = flux if isinstance(self.flux, float) else self.flux * flux
         if not refracts:
             return
-        onward = _to_lens(crossing, crossing.leaving)
+        onward = _to_lens(crossing, _wave_normal(crossing.leaving, crossing.indices[1]))
         if mirror:
             carried = [_reflected(n, along, a) for a, along in zip((u, v), w, strict=True)]
         else:
             carried = _turned((u, v), k, onward)
         self.behind = (carried[0], carried[1], onward)
+        if crystal:
+            self._enter_crystal(number)
+
+    def _enter_crystal(self, number: int) -> None:
+        """Keep the field of the ray that is followed: of an extraordinary one that in the plane of
+        wave normal and optic axis, of an ordinary one that across.
+        """
+        u, v, _ = self.behind
+        axis = [torch.as_tensor(c).to(u[0]) for c in self.system.optic_axis(number)]
+        w = _dot((axis[0], axis[1], axis[2]), u), _dot((axis[0], axis[1], axis[2]), v)
+        if not is_anisotropic(self.system.materials[number]):
+            w = w[1], -w[0]
+        self._pass(Parts(torch.zeros_like(w[0])), Parts(_over_square(w)), w)
 
     def _pass(self, t: Parts, g: Parts, w: tuple[Tensor, Tensor]) -> None:
         """Multiply by t + g·w·wᵀ."""
@@ -279,6 +301,15 @@ def _over_square(w: tuple[Tensor, Tensor]) -> Tensor:
     square = torch.addcmul(w[0] * w[0], w[1], w[1])
     small = square.detach() < torch.finfo(square.dtype).eps
     return square.masked_fill(small, torch.inf).reciprocal()
+
+
+def _wave_normal(direction: Vector, index: Any) -> Vector:
+    """Return the unit vector along the wave vector, which in a crystal is not along the ray."""
+    if not isinstance(index, Crystal):
+        return direction
+    x, y, z = index.wave_vector(direction)
+    length = torch.rsqrt(_dot((x, y, z), (x, y, z)))
+    return x * length, y * length, z * length
 
 
 def _to_lens(crossing: Crossing, direction: Vector) -> Vector:

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.crystals import Crystal, turned_axis
 from dolens.optics.elements import Axes, ElementState, surface_axes
-from dolens.optics.materials import Medium, absorption
+from dolens.optics.materials import Medium, absorption, is_anisotropic
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
 from dolens.optics.surfaces.deflection import Law
@@ -128,24 +129,72 @@ class OpticalSystem:
     def refracts(self, number: int) -> bool:
         """Return whether a surface changes the direction of light, by refraction or reflection."""
         before, behind = self.materials[number - 1], self.materials[number]
-        return number in self.mirrors or before != behind
+        # The axes of one crystal and another may be turned, although they are written alike.
+        return number in self.mirrors or before != behind or is_anisotropic(behind)
+
+    @cached_property
+    def anisotropic(self) -> tuple[int, ...]:
+        """Return the numbers of the media, from 0, in which light goes as extraordinary rays."""
+        return tuple(k for k, medium in enumerate(self.materials) if is_anisotropic(medium))
+
+    def crystals(self, wavelength: float | Tensor) -> dict[int, Crystal]:
+        """Return, by the number of the medium, the crystals that extraordinary rays go through at
+        a wavelength in nm, their optic axes in the lens's axes.
+        """
+        found: dict[int, Crystal] = {}
+        for place in self.anisotropic:
+            medium: Any = self.materials[place]
+            n_o, n_e = (
+                self._as_traced(self._shifted(m.index(self._finer(wavelength)), place))
+                for m in (medium.ordinary, medium.extraordinary)
+            )
+            found[place] = Crystal(n_o, n_e, self.optic_axis(place))
+        return found
+
+    def optic_axis(self, place: int) -> tuple[Any, Any, Any]:
+        """Return the optic axis of the crystal that medium `place` (from 0) is, in the lens's axes.
+
+        It is given in the axes of the surface in front of the crystal.
+        """
+        medium: Any = self.materials[place]
+        surface = place
+        while surface in self.mirrors or surface in self.breaks:
+            surface -= 1
+        return turned_axis(medium.axis, self.axes[surface - 1], self.dtype)
+
+    def _finer(self, wavelength: float | Tensor) -> float | Tensor:
+        """Return wavelengths on the lens's device, no less precise than the lens."""
+        if not isinstance(wavelength, Tensor):
+            return wavelength
+        finer = torch.promote_types(wavelength.dtype, self.dtype)
+        return wavelength.to(device=self.device, dtype=finer)
+
+    def _shifted(self, index: Any, place: int) -> Any:
+        """Return the index of a medium with the offset that is added to it."""
+        offset = self.index_offsets[place] if self.index_offsets else None
+        return index if offset is None else index + offset.double()
+
+    def _as_traced(self, number: Any) -> Any:
+        """Return a number, or a tensor in the precision that rays are traced in."""
+        return number.to(self.dtype) if isinstance(number, Tensor) else number
 
     def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Indices before surface 1 and after each surface, at a wavelength in nm.
 
         A tensor of wavelengths gives tensors in the lens's precision, so that the wavelengths'
-        own does not decide in which precision rays are traced.
+        own does not decide in which precision rays are traced.  Of an extraordinary ray it is the
+        index that first-order optics takes, along the lens's meridian; see `crystals`.
         """
-        if isinstance(wavelength, Tensor):
-            finer = torch.promote_types(wavelength.dtype, self.dtype)
-            wavelength = wavelength.to(device=self.device, dtype=finer)
+        wavelength = self._finer(wavelength)
         # Each medium once: air comes between all the others.
         indices = {medium: medium.index(wavelength) for medium in dict.fromkeys(self.materials)}
+        if self.anisotropic and self.meridian is not None:
+            way = (1.0, 0.0) if self.meridian == "x" else (0.0, 1.0)
+            for place in self.anisotropic:
+                crystal: Any = self.materials[place]
+                indices[crystal] = crystal.section_index(wavelength, *way)
         ordered = [indices[medium] for medium in self.materials]
-        for k, offset in enumerate(self.index_offsets):
-            if offset is not None:
-                ordered[k] = ordered[k] + offset.double()
-        return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
+        return [self._as_traced(self._shifted(n, place)) for place, n in enumerate(ordered)]
 
     def absorptions(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Return how fast light is absorbed before surface 1 and behind each surface, 1/mm: of the
@@ -400,6 +449,16 @@ def require_refracting(system: OpticalSystem, what: str) -> None:
                 f"{what}: surface {numbers[0]} is {kind}; only lenses of refracting surfaces along "
                 "one axis are held there"
             )
+
+
+def require_isotropic(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where extraordinary rays go through a lens; arguments as above."""
+    if system.anisotropic:
+        number = system.anisotropic[0]
+        raise InputError(
+            f"{what}: the medium behind surface {number} is a crystal of extraordinary rays "
+            f"({system.materials[number].name}); only media with one index are held there"
+        )
 
 
 def require_plane_sensor(system: OpticalSystem, what: str) -> None:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.crystals import Uniaxial
 from dolens.optics.glass import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment, Glass
 from dolens.optics.materials import Medium, media_of
 from dolens.optics.surfaces.base import Surface
@@ -48,6 +49,8 @@ _FIXED = ("phase.", "coating.")
 
 def medium_at(medium: Medium, environment: Environment | None) -> Medium:
     """Return a medium at a temperature and pressure; all but catalogue glass stays as it is."""
+    if isinstance(medium, Uniaxial):
+        return medium.of(lambda own: medium_at(own, environment))
     return medium.at(environment) if isinstance(medium, Glass) else medium
 
 

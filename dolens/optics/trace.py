@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.kernels.table import GRAZING
+from dolens.optics.crystals import Crystal, refract_at_crystal
 from dolens.optics.elements import (
     LENS_AXES,
     Axes,
@@ -54,7 +55,7 @@ class Crossing(NamedTuple):
         point: x, y, z, mm.
         arriving: direction in front of the surface.
         leaving: direction behind it.
-        indices: in front and behind.
+        indices: in front and behind; a `Crystal` where extraordinary rays go.
         axes: of the surface.
     """
 
@@ -62,7 +63,7 @@ class Crossing(NamedTuple):
     point: tuple[Tensor, Tensor, Tensor]
     arriving: tuple[Tensor, Tensor, Tensor]
     leaving: tuple[Tensor, Tensor, Tensor]
-    indices: tuple[float | Tensor, float | Tensor]
+    indices: tuple[Any, Any]
     axes: Axes
 
 
@@ -200,6 +201,9 @@ def enter_lens(
     else:
         distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), towards)
     index = system.indices(rays.wavelength)[front]
+    crystal = system.crystals(rays.wavelength).get(front)
+    if crystal is not None:
+        index = crystal.ray_index(ray[3:])
     moved = Components(*(c.to(system.dtype) for c in transfer(ray, distance)))
     return moved, (index * distance).to(system.dtype)
 
@@ -234,6 +238,7 @@ def trace_surfaces(
         The rays on the last surface met, travelling in the medium behind it.
     """
     indices, places, senses = system.indices(wavelength), system.axes, system.senses
+    crystals = system.crystals(wavelength)
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
     shares: list[Shares] | None = [] if transmission else None
@@ -253,7 +258,13 @@ def trace_surfaces(
                 points.append(points_to_lens_axes(crossing[:3], places[i]))
             continue
         front, back = (i, i + 1) if sense > 0 else (i + 1, i)
-        before, after = indices[front], indices[back]
+        before: Any = indices[front]
+        after: Any = indices[back]
+        if crystals:
+            before, after = (
+                crystals[k].seen_from(places[i], system.dtype) if k in crystals else indices[k]
+                for k in (front, back)
+            )
         arriving, leaving = sense * senses[front], sense * senses[back]
         here, carried = change_axes(ray, axes, places[i])
         axes = places[i]
@@ -263,7 +274,8 @@ def trace_surfaces(
         inside = surface.aperture.margin(x, y)
         if path is not None or shares is not None:
             distance = to_plane + t if carried is None else carried + to_plane + t
-            path = None if path is None else path + before * distance
+            along = before.ray_index((l, m, n)) if isinstance(before, Crystal) else before
+            path = None if path is None else path + along * distance
         if record:
             points.append(points_to_lens_axes((x, y, z), axes))
         if shares is not None:
@@ -282,6 +294,11 @@ def trace_surfaces(
                 (x, y, z), (l, m, n), media, travel
             )
             path = None if path is None else path + added
+        elif front in crystals or back in crystals:
+            normal = shape.normal(parameters, x, y, z)
+            l, m, n, transmitted = refract_at_crystal(  # noqa: E741
+                (l, m, n), normal, before, after, leaving
+            )
         elif system.refracts(number):
             l, m, n, transmitted = shape.refract(  # noqa: E741
                 parameters, (x, y, z), (l, m, n), before / after, leaving

@@ -38,7 +38,7 @@ from dolens.optics.coatings import (
     quarter_wave,
 )
 from dolens.optics.glass import Environment
-from dolens.optics.lens import Lens
+from dolens.optics.lens import Lens, check_crystals
 from dolens.optics.materials import (
     MIRROR,
     IndexModel,
@@ -192,12 +192,14 @@ def coated(lens: Lens, coating: Any) -> Lens:
     where = f"lens '{lens.name}'"
     air = environment_of({"temperature": lens.temperature, "pressure": lens.pressure}, where)
     surfaces = list(found.surfaces.values())
+    media = media_of(found.materials).materials
     if not isinstance(coating, Mapping) or any(form in coating for form in _FORMS):
         numbers = range(1, len(surfaces) + 1)
         for number, own in coatings_for(
             surfaces, found.materials, numbers, coating, where, model, air, lens.dtype
         ):
             surfaces[number - 1].coating = own
+        _check_faces(surfaces, media, where)
         return found
     for key, value in coating.items():
         if str(key) not in found.surfaces:
@@ -207,7 +209,15 @@ def coated(lens: Lens, coating: Any) -> Lens:
             raise InputError(f"{place} is a coordinate break; light does not meet it")
         surface.coating = coating_from(value, place, model, air, lens.dtype)
         check_coating(surface.coating, found.materials[int(key)], place)
+    _check_faces(surfaces, media, where)
     return found
+
+
+def _check_faces(surfaces: Sequence[Surface], media: Sequence[Medium], where: str) -> None:
+    try:
+        check_crystals(surfaces, media)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def coating_row(coating: Coating) -> Any:

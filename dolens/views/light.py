@@ -45,6 +45,21 @@ class LightViews:
 
         return coated(as_lens(self), coating)
 
+    def crystal_rays(self) -> dict[str, Lens]:
+        """Return a copy of this lens for every choice of ordinary and extraordinary rays in its
+        crystals, in the order of the light: `oe` is ordinary in the first and extraordinary in the
+        second.
+
+        Light that is split goes by all of them.  Of unpolarised light each image has a share; see
+        `trace_polarised` and [polarised light](polarisation.md).
+
+        Raises:
+            InputError: there is no crystal, or there are more than eight.
+        """
+        from dolens.optics.crystals import lenses_of_rays
+
+        return lenses_of_rays(as_lens(self))
+
     def transmission(
         self,
         fields: FieldPoints | None = None,

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from decimal import Decimal
 
 from dolens.errors import InputError
+from dolens.optics.crystals import Uniaxial
 from dolens.optics.dispersion import deviation_of_two_terms
 from dolens.optics.glass_catalog import (
     MAKERS,
@@ -386,12 +387,14 @@ def _compare(found: str, pair: Pair | None, place: str) -> None:
 
 
 def _medium(material: object, place: str) -> Medium:
+    refused = f"{place}: a .zmx file cannot hold material '{material}'"
     try:
-        return parse_material(str(material), index_model("dfc"))
+        found = parse_material(str(material), index_model("dfc"))
     except InputError as error:
-        raise InputError(
-            f"{place}: a .zmx file cannot hold material '{material}': {error}"
-        ) from None
+        raise InputError(f"{refused}: {error}") from None
+    if isinstance(found, Uniaxial):
+        raise InputError(f"{refused}: a birefringent medium is not held")
+    return found
 
 
 def _plain(word: str, place: str) -> str:
