@@ -26,7 +26,7 @@ from dolens.optics.autograd import replay
 
 METHODS = ("auto", "fourier", "direct")
 # Fewest samples across a pupil, so that its edge is where it belongs, and most.
-_FEWEST, _MOST = 96, 2048
+_FEWEST, MOST_SAMPLES = 96, 2048
 # Airy radii around the ray intercepts within which phases must be right.
 _AIRY_RADII = 10.0
 # Largest difference of the flux through the fitted pupil and of that of the rays, relative.
@@ -266,12 +266,16 @@ def _farthest(wavefront: Wavefront) -> Tensor:
     return torch.where(lit[..., None], wavefront.intercept.abs(), 0.0).amax((1, 2))
 
 
+class TooSteepError(InputError):
+    """A wavefront needs more samples across its pupil than diffraction is computed with."""
+
+
 def _enough(needed: float) -> int:
     """The next multiple of four, so that small changes of a lens leave it as it is."""
-    if not needed <= _MOST:
-        raise InputError(
+    if not needed <= MOST_SAMPLES:
+        raise TooSteepError(
             f"the wavefront is too steep for diffraction: it needs {needed:.0f} samples across the "
-            f"pupil, more than {_MOST}; rays alone describe such a spot, or give `samples`"
+            f"pupil, more than {MOST_SAMPLES}; rays alone describe such a spot, or give `samples`"
         )
     return max(_FEWEST, 4 * math.ceil(needed / 4.0))
 

@@ -265,7 +265,9 @@ class OpticalSystem:
         """Return whether nothing in the lens singles out a direction across the axis."""
         surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
         laws = all(s.deflection is None or s.deflection.law.rotational for s in self.surfaces)
-        return surfaces and laws and not self.elements
+        media: list[Any] = [self.materials[k] for k in self.anisotropic]
+        along = all(medium.axis[:2] == (0.0, 0.0) for medium in media)
+        return surfaces and laws and along and not self.elements
 
     def section(self, meridian: str | None) -> "OpticalSystem":
         """Return the same lens, whose first-order optics is that of one section; see `meridian`.

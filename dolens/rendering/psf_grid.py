@@ -20,7 +20,7 @@ from dolens.diffraction.pixel_psf import (
     wave_kernels,
     with_diffraction_limit,
 )
-from dolens.diffraction.propagation import DiffractionSettings
+from dolens.diffraction.propagation import MOST_SAMPLES, DiffractionSettings, TooSteepError
 from dolens.optics.ray_tracing import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.exit_pupil import working_f_number
@@ -174,11 +174,16 @@ def wave_cost(
     Arguments as there.
 
     Returns:
-        Samples along each side of a pupil by Fourier transform, and why one of them needs direct
-        integration, which takes a thousand times as long; None where none does.
+        Samples along each side of a pupil by Fourier transform, and why these do not do: one of the
+        functions needs direct integration, which takes a thousand times as long, or more samples
+        than there may be; None where they do.
     """
     places = object_points(imaging, points, _centres(imaging, points, distortion))
-    found = propagation(imaging.system, *places, PixelWindow(imaging.sensor.pixel_pitch, size))
+    window = PixelWindow(imaging.sensor.pixel_pitch, size)
+    try:
+        found = propagation(imaging.system, *places, window)
+    except TooSteepError as error:
+        return MOST_SAMPLES, str(error)
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
     return found.samples, next(direct, None)
 

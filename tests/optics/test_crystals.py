@@ -482,3 +482,9 @@ def test_refraction_at_grazing_incidence_is_that_of_snell():
     assert float(k[0]) == pytest.approx(math.sin(angle), rel=1e-14)
     assert float(k[1]) == pytest.approx(0.0, abs=1e-14)
     assert float(margin) > 0.0
+
+
+@pytest.mark.parametrize(("axis", "symmetric"), [("0 0 2", True), ("0 1 1", False)])
+def test_only_an_axis_along_z_leaves_a_lens_symmetric(axis, symmetric):
+    """An image between two fields is found by turning one's only where nothing singles out y."""
+    assert plate(f"{CALCITE} extraordinary {axis}").system().rotationally_symmetric == symmetric

@@ -10,6 +10,7 @@ from scipy.integrate import dblquad
 
 from dolens import load_lens
 from dolens.diffraction.pixel_psf import diffraction_transfer, with_diffraction_limit
+from dolens.diffraction.propagation import MOST_SAMPLES
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
@@ -22,7 +23,9 @@ from dolens.rendering.auto.probes import (
     probe_texture,
     reference,
 )
-from dolens.rendering.exit_pupil import ExitPupil
+from dolens.rendering.exit_pupil import ExitPupil, axial_exit_pupil
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.psf_grid import wave_cost
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -193,6 +196,18 @@ def test_diffraction_is_modelled_where_it_shows(root):
     unasked = AutoRenderer(Sensor(32, 32, 0.002), 1.0, diffraction=False).make_plan(lens, scene)
     assert unasked.renderer.diffraction == "none"
     assert any("would change" in line for line in unasked.lines())
+
+
+def test_a_wavefront_too_steep_for_waves_leaves_the_image_to_rays(root):
+    """So many turns cross the pupil 40 mm out of focus, seen 1.5 m wide; no plan dies of it."""
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float64)
+    system = lens.requires_grad_(False).system()
+    scene, sensor = PlanarScene((100.0,), LINES[1:2]), Sensor(21, 21, 0.5)
+    imaging = ImagingSystem(system, scene, sensor, axial_exit_pupil(system, LINES))
+    points = tuple(torch.zeros(1, dtype=torch.float64) for _ in "xy")
+    samples, reason = wave_cost(imaging, points, 3001, True)
+    assert samples == MOST_SAMPLES
+    assert "too steep for diffraction" in reason
 
 
 def test_the_plan_is_kept_logged_and_counted(root, caplog):
