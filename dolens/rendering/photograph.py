@@ -165,12 +165,14 @@ class StrayLight:
         lights: in the picture.
         sensor_reflectance: share of the light that the sensor reflects.
         diffraction: whether lights have it where it shows.
+        bounces: most reflections of a ghost's path, 2, 4 or 6.
     """
 
     lens: Lens
     lights: tuple[Light, ...]
     sensor_reflectance: float = 0.0
     diffraction: bool = True
+    bounces: int = 2
 
     @torch.no_grad()
     def added_to(self, image: Tensor, imaging: ImagingSystem, plane: int) -> Tensor:
@@ -178,7 +180,7 @@ class StrayLight:
         and ghosts.
         """
         given = (self.lens, imaging, plane)
-        glare = veil(*given, self.sensor_reflectance).to(image)[:, None, None]
+        glare = veil(*given, self.sensor_reflectance, self.bounces).to(image)[:, None, None]
         whole = image + glare * image.mean((-2, -1), keepdim=True)
         if not self.lights:
             return whole
@@ -187,6 +189,7 @@ class StrayLight:
             self.lights,
             sensor_reflectance=self.sensor_reflectance,
             diffraction=self.diffraction,
+            bounces=self.bounces,
         )
         return whole + found.to(image)
 

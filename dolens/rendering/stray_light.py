@@ -14,9 +14,10 @@ irradiance over that in front of the lens, into shares of white.
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from dolens.analysis.conditions import conditions
@@ -24,6 +25,7 @@ from dolens.analysis.ghosts import ENTERING, IMAGE, chosen_paths, ghost_area, gh
 from dolens.errors import InputError
 from dolens.kernels import rendering
 from dolens.optics.field_and_aperture import in_double_precision
+from dolens.optics.ghost_paths import Path
 from dolens.optics.lens import Lens
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.starburst import Starburst, bands, starburst
@@ -35,6 +37,7 @@ _RAYS_A_CELL = 40.0
 _LARGEST_CELL = 64
 # Cells of a grid around the sensor, for splines.
 _MARGIN = 2
+_BOUNCES = (2, 4, 6)
 # Fields whose ghosts make the veil, over areas that are alike, and their rays.
 _VEIL_FIELDS, _VEIL_RAYS = 4, 1000
 
@@ -46,11 +49,14 @@ class Light(NamedTuple):
         row: pixels from the top of the sensor's upright image.
         column: pixels from the left.
         power: of the light of one white pixel there; of red, green and blue.
+        shape: (K, K), K odd, shares of the power of pixels about it; None: a point.  Its ghosts are
+            those of a point.
     """
 
     row: float
     column: float
     power: tuple[float, float, float]
+    shape: Tensor | None = None
 
 
 def light_on_sensor(
@@ -61,6 +67,7 @@ def light_on_sensor(
     rays: int = 20_000,
     sensor_reflectance: float = 0.0,
     diffraction: bool = True,
+    bounces: int = 2,
 ) -> Tensor:
     """Return the image and the ghosts of lights, (C, height, width), in shares of white.
 
@@ -76,6 +83,7 @@ def light_on_sensor(
         sensor_reflectance: share of the light that the sensor reflects.
         diffraction: whether the lights' own images have it where it shows; see
             `dolens.rendering.starburst`.
+        bounces: most reflections of a ghost's path, 2, 4 or 6.
 
     Raises:
         InputError: as `dolens.analysis.ghosts.ghosts` does.
@@ -83,7 +91,7 @@ def light_on_sensor(
     lens, sensor = in_double_precision(lens), imaging.sensor
     scene, system = imaging.scene, lens.system()
     depth, scale = scene.depths[plane], scene.magnifications(system)[plane]
-    paths = chosen_paths(lens, 2, sensor_reflectance > 0.0, None)
+    paths = _paths(lens, bounces, sensor_reflectance)
     white = math.pi * _axial_aperture(imaging)
     shape = (sensor.height, sensor.width)
     channels = []
@@ -103,27 +111,53 @@ def light_on_sensor(
                 if part.path == ENTERING or not len(part.light):
                     continue
                 rows, columns = sensor.pixels(*part.points.unbind(-1))
-                arriving = factor * part.light
-                if part.path == IMAGE and diffraction:
-                    power = arriving.sum()
-                    given = (
-                        system,
-                        sensor,
-                        (x, y, -depth),
-                        wavelength,
-                        band,
-                        float(power.detach()),
-                    )
-                    star = starburst(*given)
-                    if star is not None:
-                        found = found + power * _with_starburst(
-                            rows, columns, arriving, star, shape
-                        )
-                        continue
-                cell = 1 if part.path == IMAGE else _cell(rows, columns)
-                grids[cell].append((rows, columns, arriving))
+                rays_of = (rows, columns, factor * part.light)
+                if part.path != IMAGE:
+                    grids[_cell(rows, columns)].append(rays_of)
+                    continue
+                power = float(rays_of[2].detach().sum())
+                star = None
+                if diffraction:
+                    star = starburst(system, sensor, (x, y, -depth), wavelength, band, power)
+                found = found + _own_image(rays_of, star, light.shape, shape)
         channels.append(sum((_on_pixels(*grid, shape) for grid in grids.items()), found))
     return torch.stack(channels)
+
+
+def _paths(lens: Lens, bounces: int, sensor_reflectance: float) -> list[Path]:
+    """Return all ghost paths of two reflections, and of as many more as are asked for."""
+    if bounces not in _BOUNCES:
+        raise InputError(f"bounces: {bounces}; allowed: 2, 4, 6")
+    counts = [count for count in _BOUNCES if count <= bounces]
+    return [p for n in counts for p in chosen_paths(lens, n, sensor_reflectance > 0.0, None)]
+
+
+def _own_image(
+    rays: tuple[Tensor, Tensor, Tensor],
+    star: Starburst | None,
+    source: Tensor | None,
+    shape: tuple[int, int],
+) -> Tensor:
+    """Return the image (height, width) of a light.
+
+    Args:
+        rays: rows, columns and light of rays, (N,) each.
+        star: its diffraction; None: rays alone.
+        source: (K, K), the light's shape; None: a point.
+        shape: height and width.
+    """
+    if star is None:
+        image = _on_pixels(1, [rays], shape)
+    else:
+        image = rays[2].sum() * _with_starburst(*rays, star, shape)
+    if source is None:
+        return image
+    size = [next_fast_len(side + len(source) - 1, real=True) for side in shape]
+    spectrum = torch.fft.rfft2(image, s=size) * torch.fft.rfft2(source.to(image), s=size)
+    half = len(source) // 2
+    whole = torch.fft.irfft2(spectrum, s=size)
+    # What transforms round below zero is nothing.
+    return whole[half : half + shape[0], half : half + shape[1]].clamp(min=0.0)
 
 
 def _with_starburst(
@@ -200,7 +234,13 @@ def _on_pixels(
 
 
 @torch.no_grad()
-def veil(lens: Lens, imaging: ImagingSystem, plane: int, sensor_reflectance: float = 0.0) -> Tensor:
+def veil(
+    lens: Lens,
+    imaging: ImagingSystem,
+    plane: int,
+    sensor_reflectance: float = 0.0,
+    bounces: int = 2,
+) -> Tensor:
     """Return the power of ghosts on the sensor over that of the image, (C,): the mean over the
     picture's area.
 
@@ -209,11 +249,12 @@ def veil(lens: Lens, imaging: ImagingSystem, plane: int, sensor_reflectance: flo
         imaging: planes, wavelengths and pixels.
         plane: number of the plane, from 0.
         sensor_reflectance: share of the light that the sensor reflects.
+        bounces: most reflections of a ghost's path, 2, 4 or 6.
     """
     lens, sensor, scene = in_double_precision(lens), imaging.sensor, imaging.scene
     depth, scale = scene.depths[plane], scene.magnifications(lens.system())[plane]
     corner = 0.5 * math.hypot(sensor.width, sensor.height) * sensor.pixel_pitch
-    paths = chosen_paths(lens, 2, sensor_reflectance > 0.0, None)
+    paths = _paths(lens, bounces, sensor_reflectance)
     found = []
     for wavelength in scene.wavelengths:
         ghosts = image = 0.0
@@ -239,8 +280,33 @@ def _caught(points: Tensor, sensor: Sensor) -> Tensor:
     return inside & (columns > -0.5) & (columns < sensor.width - 0.5)
 
 
+Place = TypeVar("Place", float, Tensor)
+
+
+def on_pixels_of(
+    place: tuple[Place, Place], picture: tuple[int, int], sensor: Sensor, cover: float
+) -> tuple[tuple[Place, Place], float]:
+    """Return rows and columns of a picture in pixels of a sensor as a pinhole sees them, and how
+    many of these a pixel of the picture is.
+
+    Args:
+        place: pixels of the picture.
+        picture: its height and width, pixels; it fills the sensor.
+        sensor: the pixels.
+        cover: how many times as large as the pinhole's the picture is (see `WholeField.cover`).
+    """
+    (height, width), (row, column) = picture, place
+    down, across = cover * sensor.height / height, cover * sensor.width / width
+    rows = (row - 0.5 * (height - 1)) * down + 0.5 * (sensor.height - 1)
+    columns = (column - 0.5 * (width - 1)) * across + 0.5 * (sensor.width - 1)
+    return (rows, columns), down * across
+
+
 def lights_of(
-    given: Sequence[Sequence[float]], picture: tuple[int, int], sensor: Sensor
+    given: Sequence[Sequence[float]],
+    picture: tuple[int, int],
+    sensor: Sensor,
+    cover: float = 1.0,
 ) -> list[Light]:
     """Return lights as a user names them.
 
@@ -249,6 +315,7 @@ def lights_of(
             it: one number or three.
         picture: its height and width, pixels; it fills the sensor.
         sensor: the pixels.
+        cover: as of `on_pixels_of`.
 
     Raises:
         InputError: a light that has other numbers, none of them finite, or lies beside the picture.
@@ -270,14 +337,7 @@ def lights_of(
                 f"lights: number {number} is at row {row:g}, column {column:g}; allowed: within "
                 f"the picture of {height} × {width} pixels"
             )
-        down, across = sensor.height / height, sensor.width / width
         red, green, blue = (power * 3)[:3] if len(power) == 1 else power
-        area = down * across
-        found.append(
-            Light(
-                (row + 0.5) * down - 0.5,
-                (column + 0.5) * across - 0.5,
-                (red * area, green * area, blue * area),
-            )
-        )
+        (row, column), area = on_pixels_of((row, column), picture, sensor, cover)
+        found.append(Light(row, column, (red * area, green * area, blue * area)))
     return found

@@ -252,9 +252,11 @@ def texture_coordinates(
 
 
 def resized(picture: Tensor, height: int, width: int) -> Tensor:
-    """Return a picture (3, h, w) in linear light at another size, as crops of photographs are."""
+    """Return a picture (3, h, w) in linear light at another size, as crops of photographs are; none
+    is brighter than white, or than the picture itself where that is.
+    """
     if picture.shape[-2:] == (height, width):
         return picture
     size = (height, width)
     found = functional.interpolate(picture[None], size, mode="bicubic", antialias=True)
-    return found[0].clamp(0.0, 1.0)
+    return found[0].clamp(0.0, max(1.0, float(picture.max())))

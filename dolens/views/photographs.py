@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from dolens.optics.lens import Lens
     from dolens.rendering.photograph import Photograph
 
+_FROM_PICTURE = "from picture"
+
 
 class PhotographViews:
     """Methods of `Lens` that photograph."""
@@ -49,8 +51,9 @@ class PhotographViews:
         pixel_pitch: float | None = None,
         diffraction: str | None = None,
         seed: int = 0,
-        lights: Sequence[Sequence[float]] | None = None,
+        lights: Sequence[Sequence[float]] | str | None = None,
         sensor_reflectance: float = 0.0,
+        bounces: int = 2,
     ) -> Photograph:
         """Return what a sensor behind the lens sees of a picture, which is a plane before it.
 
@@ -91,8 +94,11 @@ class PhotographViews:
                 picture and its power over that of a white pixel, one number or three; with their
                 starbursts where these show and `diffraction` is not `none`, with their ghosts, and
                 the veil of the scene's own (see `dolens.rendering.stray_light`).  An empty list:
-                the veil alone; None: no stray light.
+                the veil alone; None: no stray light.  `from picture`: those of a picture that
+                holds radiance over white (see `dolens.rendering.scene_lights`): a file of Radiance,
+                or floating-point numbers, which are linear light then, 1 for white.
             sensor_reflectance: share of the light that the sensor reflects, for ghosts.
+            bounces: most reflections of a ghost's path, 2, 4 or 6, which take ever longer.
 
         Returns:
             A `Photograph`: `image` and `truth` (3, H, W), sRGB; `save(path)`; it shows itself in a
@@ -105,8 +111,10 @@ class PhotographViews:
         from dolens.errors import InputError
         from dolens.rendering.lens_camera import required_number, sensor_behind
         from dolens.rendering.photograph import LensCamera, StrayLight, readout_in
+        from dolens.rendering.scene_lights import lights_in
         from dolens.rendering.stray_light import lights_of
         from dolens.sensor.display import linear_picture
+        from dolens.sensor.radiance import radiance_picture
 
         lens = as_lens(self)
         distances = (
@@ -117,7 +125,9 @@ class PhotographViews:
         if not isinstance(seed, int) or not 0 <= seed < 2**63:
             raise InputError(f"seed: {seed}; allowed: whole numbers from 0 to 2^63 - 1")
         readout = readout_in(light, read_noise, pattern)
-        linear = linear_picture(picture)
+        if isinstance(lights, str) and lights != _FROM_PICTURE:
+            raise InputError(f"lights: {lights!r}; allowed: a list, or {_FROM_PICTURE!r}")
+        linear = (radiance_picture if lights == _FROM_PICTURE else linear_picture)(picture)
         height, width = linear.shape[-2:]
         pixels = sensor_behind(lens, (height, width), sensor, pixel_pitch)
         camera = LensCamera.of(lens, pixels, readout, distances, diffraction)
@@ -125,8 +135,10 @@ class PhotographViews:
             share = required_number(
                 "sensor_reflectance", sensor_reflectance, 1.0, "of the light", from_zero=True
             )
-            found = tuple(lights_of(lights, (height, width), pixels))
-            camera = replace(
-                camera, stray_light=StrayLight(lens, found, share, diffraction != "none")
-            )
+            if isinstance(lights, str):
+                linear, found = lights_in(linear, pixels, camera.field.cover())
+            else:
+                found = lights_of(lights, (height, width), pixels, camera.field.cover())
+            stray = StrayLight(lens, tuple(found), share, diffraction != "none", bounces)
+            camera = replace(camera, stray_light=stray)
         return next(camera.photographs(linear, seed))

@@ -61,6 +61,21 @@ def test_ghosts_have_the_power_that_their_analysis_gives(bare, imaging):
     assert 0.5 * least < stray / own < 1.1 * known.total
 
 
+def test_four_reflections_are_added_to_two(bare):
+    """What they add has the power of the paths of four, on a sensor that misses little of it."""
+    wide = ImagingSystem.of(bare.system(), PlanarScene((FAR,), (GREEN,)), Sensor(61, 61, 0.6))
+    two, four = (
+        light_on_sensor(bare, wide, 0, [light(30, 30)], 400, diffraction=False, bounces=n).sum()
+        for n in (2, 4)
+    )
+    known = ghosts(bare, conditions(bare, [0.0], [GREEN]), rays=400, bounces=4)
+    landed = known.measures.rms.nan_to_num(0.0) < 9.0
+    least = float(known.measures.power[landed].nansum())
+    assert least < float((four - two) / two) < known.total
+    with pytest.raises(InputError, match="bounces: 3; allowed: 2, 4, 6"):
+        light_on_sensor(bare, wide, 0, [], bounces=3)
+
+
 def test_coatings_quench_ghosts(bare, imaging):
     coated = bare.coated("quarter_wave").requires_grad_(False)
     both = [float(veil(lens, imaging, 0)) for lens in (bare, coated)]
