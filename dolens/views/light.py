@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from dolens.analysis.fields_and_wavelengths import FieldPoints
     from dolens.analysis.transmission import Transmission
+    from dolens.diffraction.gaussian_beams import FibreCoupling, GaussianBeam
     from dolens.optics.lens import Lens
     from dolens.views.overview import Wavelengths
 
@@ -128,3 +129,62 @@ class LightViews:
         name = "crossed polarisers" if crossed else "with the elements"
         title = title_of("Polarisation", lens, given)
         return shown(jones_pupils_figure(own, between, name, title))
+
+    def gaussian_beam(
+        self,
+        waist: float,
+        waist_z: float = 0.0,
+        wavelength: float | None = None,
+        m_squared: float = 1.0,
+        meridian: str | None = None,
+    ) -> GaussianBeam:
+        """Return a Gaussian beam's radius and waist at every surface, by first-order optics; it
+        shows itself as text.
+
+        Example:
+            >>> import dolens
+            >>> beam = dolens.load_lens("cooke_triplet").gaussian_beam(1.0, wavelength=587.5618)
+            >>> sensor = beam.rows[-1]
+            >>> round(1000.0 * sensor.radius, 1), round(sensor.half_angle, 2)  # µm, degrees
+            (10.4, 1.15)
+
+        Args:
+            waist: radius at 1/e² of the irradiance, of the waist in front of the lens, mm.
+            waist_z: of the waist, mm from the first vertex.
+            wavelength: nm; None: the reference wavelength.
+            m_squared: how many times wider than the diffraction limit the far field is.
+            meridian: `x` or `y`; None: the mean of both sections.
+        """
+        from dolens.diffraction.gaussian_beams import gaussian_beam
+
+        return gaussian_beam(as_lens(self), waist, waist_z, wavelength, m_squared, meridian)
+
+    def fibre_coupling(
+        self,
+        source: float,
+        fibre: float | None = None,
+        position: Sequence[float] | None = None,
+        tilt: Sequence[float] | None = None,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        **aperture: float,
+    ) -> FibreCoupling:
+        """Return how much of a fibre's or a laser's light enters a fibre at the sensor; it shows
+        itself as text.
+
+        Args:
+            source: mode radius of the source fibre, mm, at the object; with the object at infinity
+                the radius of a collimated beam.
+            fibre: mode radius of the receiving fibre, mm; None: of the same.
+            position: of the receiving fibre on the sensor, mm; None: where chief rays land.
+            tilt: of it, degrees; None: along the light.
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: see the class.
+            object_distance: see the class.
+            aperture: see the class.
+        """
+        from dolens.diffraction.gaussian_beams import fibre_coupling
+
+        lens, given = looked_at(self.fibre_coupling, fields, wavelengths, object_distance, aperture)
+        return fibre_coupling(lens, given, source, fibre, position, tilt)
