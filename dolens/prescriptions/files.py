@@ -5,6 +5,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,6 @@ from dolens.prescriptions.plain_values import plain_values
 from dolens.prescriptions.row_data import elements_from
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUBLISHED_KEY
-from dolens.prescriptions.zemax.coatings import coating_files
 
 __all__ = [
     "SUFFIXES",
@@ -247,7 +247,12 @@ def load_lens(
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    with glass_folders(glass_catalogues), coating_files(coatings):
+    with ExitStack() as places:
+        places.enter_context(glass_folders(glass_catalogues))
+        if coatings:
+            from dolens.prescriptions.zemax.coatings import coating_files  # no other format has any
+
+            places.enter_context(coating_files(coatings))
         prescription, passed_over = read_lens_file(path)
         if passed_over:
             logger.info("%s: passed over: %s", path, "; ".join(passed_over))
