@@ -19,11 +19,13 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.conditions import Conditions
-from dolens.analysis.modulation_transfer import field_directions
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points, part_of
-from dolens.diffraction.modulation_transfer import DiffractionModulation
+from dolens.diffraction.modulation_transfer import (
+    DiffractionModulation,
+    modulation_of_windows,
+)
 from dolens.diffraction.point_spread import (
     FieldPointSpread,
     PointSpread,
@@ -118,7 +120,7 @@ def huygens_point_spread(
         strehl = highest / float(perfect)
         window = 1e-6 * irradiance
         rows.append(FieldPointSpread(1e3 * half, window, held, strehl, True, reason, error))
-    return of_all_fields(found, airy_radius_um(lens, where), rows)
+    return of_all_fields(found.where, found.centre, airy_radius_um(lens, where), rows)
 
 
 @torch.no_grad()
@@ -221,12 +223,6 @@ class _Wavelets:
         return mixed, self.weights @ perfect / total
 
 
-# Airy radii that the window is wider, on every side, than that of a point spread function; and
-# points of the image to an Airy radius: three leave the copies of a spectrum that ends at 1.22 over
-# the radius well apart.
-_AIRY_RADII, _STEPS = 4.0, 3.0
-
-
 @torch.no_grad()
 def huygens_modulation(
     lens: Lens, where: Conditions, frequencies: Sequence[float] | Tensor
@@ -249,54 +245,9 @@ def huygens_modulation(
     Raises:
         InputError: as `huygens_point_spread`.
     """
-    frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu().reshape(-1)
-    unknown = torch.full_like(frequency, math.nan)
-    curves: list[Tensor] = []
-    errors: list[float] = []
-    diffraction: list[bool] = []
-    reasons: list[str] = []
-    for field, way in zip(where.fields, field_directions(where), strict=True):
-        here = where.at(field[None])
-        half, airy = huygens_window(lens, here)
-        half += _AIRY_RADII * airy
-        cells = math.ceil(2.0 * half * _STEPS / airy)
-        found = huygens_point_spread(lens, here, cells, half)
-        reasons += found.reasons
-        diffraction += found.diffraction
-        if not found.diffraction[0]:
-            curves.append(torch.stack((unknown, unknown)))
-            errors.append(math.nan)
-            continue
-        ways = torch.stack((way, torch.stack((way[1], -way[0]))))
-        curves.append(_transform(found.irradiance[0], float(found.half_width_um), frequency, ways))
-        errors.append(float(found.sampling_error) + abs(1.0 - float(found.held)))
-    tangential, sagittal = torch.stack(curves, 1)
-    limit = unknown.expand(len(where.fields), -1)
-    return DiffractionModulation(
-        where.that_count(),
-        frequency,
-        tangential,
-        sagittal,
-        limit,
-        limit,
-        tuple(diffraction),
-        tuple(reasons),
-        torch.tensor(errors, dtype=torch.float64),
+    return modulation_of_windows(
+        where,
+        frequencies,
+        lambda here: huygens_window(lens, here),
+        lambda here, cells, half_um: huygens_point_spread(lens, here, cells, half_um),
     )
-
-
-def _transform(irradiance: Tensor, half_um: float, frequency: Tensor, ways: Tensor) -> Tensor:
-    """Return |∬E·exp(-2πi·ν·(p·way))|, (2, Q), of irradiance (M, M) in shares per µm²."""
-    cells = len(irradiance)
-    step = 2.0 * half_um / cells
-    place = 1e-3 * ((torch.arange(cells).to(irradiance) + 0.5) * step - half_um)
-    found = []
-    for x, y in ways.tolist():
-        # exp(-2πi·ν·(x·X + y·Y)) is a product of one of columns and one of rows.
-        across, down = (
-            torch.polar(torch.ones_like(phase), phase)
-            for phase in (-2.0 * math.pi * frequency[:, None] * w * place for w in (x, y))
-        )
-        sums = ((down @ irradiance.to(down)) * across).sum(-1)
-        found.append(step * step * sums.abs())
-    return torch.stack(found)

@@ -1,7 +1,7 @@
 """The modulation transfer function with diffraction, from the pupil's autocorrelation."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,8 +9,14 @@ from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.modulation_transfer import field_directions, modulation
+from dolens.diffraction.element_spread import (
+    element_airy_radius_um,
+    element_half_width,
+    field_lights,
+)
 from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
+from dolens.diffraction.point_spread import PointSpread, point_spread
 from dolens.optics.lens import Lens
 
 # Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.
@@ -61,7 +67,8 @@ def diffraction_modulation(
     """Compute the polychromatic MTF with diffraction.
 
     Where a wavefront is too steep for a Fourier transform of the pupil, the field has the geometric
-    MTF of its rays; `reasons` says so.
+    MTF of its rays; `reasons` says so.  Behind a diffractive element it is that of its point spread
+    functions.
 
     Args:
         lens: the lens.
@@ -74,6 +81,13 @@ def diffraction_modulation(
             more than some 50 Airy radii to the rays of `analysis.modulation_transfer.modulation`,
             2000 for each wavelength.
     """
+    if lens.system().diffractive:
+        return modulation_of_windows(
+            where,
+            frequencies,
+            lambda here: _element_window(lens, here),
+            lambda here, cells, half_um: point_spread(lens, here, cells, half_um),
+        )
     prepared = prepared or prepare_pupils(lens, where, _MOST_SAMPLES, draft)
     found, pupils = prepared.wavefronts, prepared.pupils
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
@@ -112,6 +126,13 @@ def diffraction_modulation(
     )
 
 
+def _element_window(lens: Lens, where: Conditions) -> tuple[float, float]:
+    """Return half width and Airy radius, µm, of the window of a field behind an element."""
+    (light,) = field_lights(lens, where)
+    airy = element_airy_radius_um(light, where.weights)
+    return 1e3 * element_half_width(light, 1e-3 * airy), airy
+
+
 def _by_rays(lens: Lens, prepared: PreparedPupils, frequency: Tensor) -> dict[int, Tensor]:
     """Return tangential and sagittal curves (2, Q) of the fields that diffraction is no part of."""
     pupils, where = prepared.pupils, prepared.wavefronts.where
@@ -121,3 +142,82 @@ def _by_rays(lens: Lens, prepared: PreparedPupils, frequency: Tensor) -> dict[in
     found = modulation(lens, where.at(where.fields[numbers]), frequency, _DRAFT_RAYS)
     curves = torch.stack((found.tangential, found.sagittal), 1).to(frequency)
     return dict(zip(numbers, curves, strict=True))
+
+
+# Airy radii that the window is wider, on every side, than that of a point spread function; and
+# points of the image to an Airy radius: three leave the copies of a spectrum that ends at 1.22 over
+# the radius well apart.
+_AIRY_RADII, _STEPS = 4.0, 3.0
+
+
+@torch.no_grad()
+def modulation_of_windows(
+    where: Conditions,
+    frequencies: Sequence[float] | Tensor,
+    window: Callable[[Conditions], tuple[float, float]],
+    spread: Callable[[Conditions, int, float], PointSpread],
+) -> DiffractionModulation:
+    """Compute the polychromatic MTF from point spread functions.
+
+    Light that falls beyond a window is missing in the modulation, which is that of all light.
+
+    Args:
+        where: fields, wavelengths with their weights, and object distance.
+        frequencies: (Q,), cycles/mm.
+        window: conditions of one field → half width of its window, and its Airy radius, µm.
+        spread: conditions of one field, cells a side, and half width (µm) → the function.
+
+    Returns:
+        The curves; the limits, which need a second pupil, are NaN.
+    """
+    frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu().reshape(-1)
+    unknown = torch.full_like(frequency, math.nan)
+    curves: list[Tensor] = []
+    errors: list[float] = []
+    diffraction: list[bool] = []
+    reasons: list[str] = []
+    for field, way in zip(where.fields, field_directions(where), strict=True):
+        here = where.at(field[None])
+        half, airy = window(here)
+        half += _AIRY_RADII * airy
+        cells = math.ceil(2.0 * half * _STEPS / airy)
+        found = spread(here, cells, half)
+        reasons += found.reasons
+        diffraction += found.diffraction
+        if not found.diffraction[0]:
+            curves.append(torch.stack((unknown, unknown)))
+            errors.append(math.nan)
+            continue
+        ways = torch.stack((way, torch.stack((way[1], -way[0]))))
+        curves.append(_transform(found.irradiance[0], float(found.half_width_um), frequency, ways))
+        errors.append(float(found.sampling_error) + abs(1.0 - float(found.held)))
+    tangential, sagittal = torch.stack(curves, 1)
+    limit = unknown.expand(len(where.fields), -1)
+    return DiffractionModulation(
+        where.that_count(),
+        frequency,
+        tangential,
+        sagittal,
+        limit,
+        limit,
+        tuple(diffraction),
+        tuple(reasons),
+        torch.tensor(errors, dtype=torch.float64),
+    )
+
+
+def _transform(irradiance: Tensor, half_um: float, frequency: Tensor, ways: Tensor) -> Tensor:
+    """Return |∬E·exp(-2πi·ν·(p·way))|, (2, Q), of irradiance (M, M) in shares per µm²."""
+    cells = len(irradiance)
+    step = 2.0 * half_um / cells
+    place = 1e-3 * ((torch.arange(cells).to(irradiance) + 0.5) * step - half_um)
+    found = []
+    for x, y in ways.tolist():
+        # exp(-2πi·ν·(x·X + y·Y)) is a product of one of columns and one of rows.
+        across, down = (
+            torch.polar(torch.ones_like(phase), phase)
+            for phase in (-2.0 * math.pi * frequency[:, None] * w * place for w in (x, y))
+        )
+        sums = ((down @ irradiance.to(down)) * across).sum(-1)
+        found.append(step * step * sums.abs())
+    return torch.stack(found)

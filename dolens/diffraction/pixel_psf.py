@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.diffraction.element_waves import ElementLight, element_light
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.propagation import (
     DiffractionSettings,
@@ -134,6 +135,8 @@ def wave_kernels(
     tent, as in `axial_point_spread_functions`: the discrete convolution of a texture with it is the
     image, wherever the field is small enough for one kernel.
 
+    Behind a diffractive element light goes as `dolens.diffraction.element_waves` says.
+
     Where the Fourier transform does not hold, the integral is done directly, which takes a thousand
     times as long; the log says so and why, and so does `propagation`.
 
@@ -156,6 +159,11 @@ def wave_kernels(
         InputError: numbers that do not fit, or a wavefront too steep for diffraction.
     """
     settings = settings or DiffractionSettings()
+    if system.diffractive:
+        light = element_light(system, _object_points(points), wavelength, centres, settings)
+        return _by_element(light, window, system.dtype)
+    if settings.method == "spectrum":
+        raise InputError("method spectrum is that of a lens with a diffractive element")
     found = _prepare(system, points, wavelength, centres, window, settings)
     cells = settings.subsamples or subsamples(found.fit, window.pitch)
     pixels = _Subpixels(window, cells, system.dtype)
@@ -194,7 +202,43 @@ def propagation(
 ) -> Propagation:
     """Say how `wave_kernels` of the same arguments propagates light by itself, and why."""
     settings = settings or DiffractionSettings()
+    if system.diffractive:
+        light = element_light(system, _object_points(points), wavelength, centres, settings)
+        return _element_propagation(light, window)
     return _prepare(system, points, wavelength, centres, window, settings).chosen
+
+
+def _object_points(points: Points) -> ObjectPoints:
+    return points if isinstance(points, ObjectPoints) else ObjectPoints.at(points)
+
+
+def _element_propagation(light: ElementLight, window: PixelWindow) -> Propagation:
+    plans = [light.plan(n, window.half_width) for n in range(len(light))]
+    none = torch.zeros_like(light.fit.residual)
+    return Propagation(
+        fourier=torch.tensor([plan.method == "fourier" for plan in plans]),
+        reasons=tuple(plan.reason for plan in plans),
+        fit_residual=light.fit.residual,
+        sphere_term=torch.tensor([plan.phase_error for plan in plans]).to(none),
+        distortion=none,
+        flux_error=none,
+        samples=max(plan.count for plan in plans),
+    )
+
+
+def _by_element(light: ElementLight, window: PixelWindow, dtype: torch.dtype) -> Tensor:
+    """Return kernels (N, size, size) of light behind a diffractive element, a point at a time."""
+    plans = [light.plan(n, window.half_width) for n in range(len(light))]
+
+    def kernel(i: int, *tensors: Tensor) -> Tensor:
+        plan = plans[i]
+        count = light.settings.subsamples or math.ceil(plan.band * window.pitch + 2.0)
+        pixels = _Subpixels(window, count, dtype)
+        x, y = pixels.grid(light.centre)
+        field = light.with_tensors(tensors).field(i, plan, x, y, dtype)
+        return pixels.integrated(field)[..., None]
+
+    return replay(kernel, [1] * len(plans), light.tensors).movedim(-1, 0)
 
 
 @dataclass(frozen=True)
@@ -243,8 +287,7 @@ def _prepare(
     window: PixelWindow,
     settings: DiffractionSettings,
 ) -> _Prepared:
-    if not isinstance(points, ObjectPoints):
-        points = ObjectPoints.at(points)
+    points = _object_points(points)
     rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
     fit = with_differentiable_bounds(_fitted(rays, settings))
     points = points.to(rays.opd.dtype, rays.opd.device)

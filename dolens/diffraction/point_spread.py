@@ -11,8 +11,15 @@ from torch import Tensor
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
+from dolens.diffraction.element_spread import (
+    element_airy_radius_um,
+    element_half_width,
+    element_sampling_error,
+    field_lights,
+    mean_irradiance,
+)
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
-from dolens.diffraction.field_wavefronts import FieldWavefronts, PreparedPupils, prepare_pupils
+from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.wavefront_map import wavefront_errors
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
@@ -73,12 +80,13 @@ class FieldPointSpread(NamedTuple):
 
 
 def of_all_fields(
-    found: FieldWavefronts, airy_radius_um: float, rows: Sequence[FieldPointSpread]
+    where: Conditions, centre: Tensor, airy_radius_um: float, rows: Sequence[FieldPointSpread]
 ) -> PointSpread:
     """Return the point spread functions of all fields.
 
     Args:
-        found: the wavefronts that they were computed from.
+        where: the conditions that they were computed under.
+        centre: (F, 2), mm on the sensor, of their windows.
         airy_radius_um: µm.
         rows: one for each field.
     """
@@ -87,8 +95,8 @@ def of_all_fields(
         return torch.tensor(list(values), dtype=torch.float64)
 
     return PointSpread(
-        found.where,
-        found.centre,
+        where,
+        centre,
         numbers(row.half_width_um for row in rows),
         torch.stack([row.irradiance.cpu() for row in rows]),
         numbers(row.held for row in rows),
@@ -111,7 +119,8 @@ def point_spread(
     """Compute the point spread function of every field, by the Fourier transform of its pupil.
 
     Where the wavefront is too steep for that, rays alone make the image; `reasons` says so.  The
-    sampling error is estimated by a second transform of half of the pupil's samples.
+    sampling error is estimated by a second transform of half of the pupil's samples.  Behind a
+    diffractive element light goes as `dolens.diffraction.element_waves` says.
 
     Args:
         lens: the lens.
@@ -127,6 +136,8 @@ def point_spread(
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
+    if lens.system().diffractive:
+        return _behind_element(lens, where, cells, half_width_um)
     prepared = prepared or prepare_pupils(lens, where)
     rows = []
     for pupil in prepared.pupils:
@@ -139,8 +150,31 @@ def point_spread(
         how = pupil.diffraction, pupil.reason, _sampling_error(pupil, half, cells)
         row = FieldPointSpread(1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how)
         rows.append(row)
-    airy = airy_radius_um(lens, prepared.wavefronts.where)
-    return of_all_fields(prepared.wavefronts, airy, rows)
+    found = prepared.wavefronts
+    return of_all_fields(found.where, found.centre, airy_radius_um(lens, found.where), rows)
+
+
+def _behind_element(
+    lens: Lens, where: Conditions, cells: int, half_width_um: float | None
+) -> PointSpread:
+    """Return the point spread functions of a lens with a diffractive element, all its orders."""
+    where = where.that_count()
+    rows, centres, airy = [], [], []
+    for light in field_lights(lens, where):
+        centres.append(light.centre[0].cpu())
+        if not bool((light.fit.wavefront.flux > 0.0).any()):
+            rows.append(FieldPointSpread.dark(cells))
+            continue
+        airy.append(element_airy_radius_um(light, where.weights))
+        half = 1e-3 * half_width_um if half_width_um else element_half_width(light, 1e-3 * airy[-1])
+        means, peak, perfect = mean_irradiance(light, where.weights, half, cells)
+        held = float(means.sum()) * (2.0 * half / cells) ** 2
+        reason = light.plan(len(light) - 1, half).reason
+        error = element_sampling_error(light, where.weights, half, cells)
+        how = peak / perfect, True, reason, error
+        rows.append(FieldPointSpread(1e3 * half, 1e-6 * means, held, *how))
+    radius = airy[0] if airy else math.nan
+    return of_all_fields(where, torch.stack(centres), radius, rows)
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from dolens.diffraction.wavefront import MM_PER_NM, Wavefront
 from dolens.errors import InputError, check_choice
 from dolens.optics.autograd import replay
 
-METHODS = ("auto", "fourier", "direct")
+METHODS = ("auto", "fourier", "spectrum", "direct")
 # Fewest samples across a pupil, so that its edge is where it belongs, and most.
 _FEWEST, MOST_SAMPLES = 96, 2048
 # Airy radii around the ray intercepts within which phases must be right.
@@ -42,7 +42,8 @@ class DiffractionSettings:
     """Settings of a diffraction computation: how finely it is sampled.
 
     Attributes:
-        method: `fourier`, `direct`, or `auto`: Fourier transform where its phases hold.
+        method: `fourier`, `direct`, or `auto`: Fourier transform where its phases hold; behind a
+            diffractive element also `spectrum` (see `dolens.diffraction.free_space`).
         phase_error: waves, the largest error of a phase that the Fourier transform may make.
         rays: along each side of the box of rays that the wavefront is fitted to.
         degree: of the fit; None: 10, or 16 where 10 leaves a hundredth of `phase_error`.

@@ -241,6 +241,7 @@ def pupil_wavefront(
     samples: int = 32,
     radius: float | Tensor | None = None,
     beam: EntranceBeam | None = None,
+    on_sensor: bool = False,
 ) -> Wavefront:
     """Trace the wavefronts of object points to reference spheres about points of the sensor.
 
@@ -258,6 +259,8 @@ def pupil_wavefront(
         radius: mm, of the reference spheres, one or N; infinite ones are planes far away.  None: to
             the paraxial exit pupil at the first wavelength (see `sphere_curvature`).
         beam: of the same points through this lens; None: it is searched.
+        on_sensor: paths end on the plane of the sensor, in the place of a sphere: `direction` is
+            then where rays meet it, mm from `centre`, `area` in mm², and amplitude² flux per mm².
 
     Returns:
         Wavefronts, differentiable in the lens; the spheres are held constant.  A point whose light
@@ -286,7 +289,11 @@ def pupil_wavefront(
             raise InputError(f"centres must be ({len(points)}, 2) in mm, not {tuple(centre.shape)}")
     if radius is not None:
         radius = _one_each("radii", radius, len(points), options)
-    curvature = sphere_curvature(system, centre, float(waves[0]), radius)
+    curvature = (
+        torch.zeros_like(waves)
+        if on_sensor
+        else sphere_curvature(system, centre, float(waves[0]), radius)
+    )
 
     # A cell around the beam, so that its edge lies inside the grid.
     half_width = beam.half_width * (samples / (samples - 2.0))
@@ -300,6 +307,8 @@ def pupil_wavefront(
         away, arriving, path = on_tangent_planes(system, hit, centre)
     excess, direction, meets = to_sphere(away, arriving, curvature[:, None, None])
     excess = excess - path
+    if on_sensor:
+        excess, direction = torch.zeros_like(excess), away
     valid = _with_neighbours(hit.valid & meets)
     index = system.materials[-1].index(waves) * torch.ones_like(waves)
     start = system.materials[0].index(every) * path_before(points, q)

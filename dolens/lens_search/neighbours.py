@@ -242,6 +242,8 @@ def _check_kinds(lens: Lens, object_distance: float | None) -> None:
                 f"{name}: surface {number} has a coating, and a search's lenses have none; search "
                 "from lens.coated('ideal')"
             )
+        if surface.diffractive is not None:
+            raise InputError(f"{name}: surface {number} is diffractive; a search's lenses are not")
         others = {n for n, p in surface.named_parameters() if bool((p != 0.0).any())}
         if others - {"curvature"} or surface.law is not None or surface.changes_axes:
             raise InputError(f"{name}: surface {number}; allowed: spheres and planes in line")

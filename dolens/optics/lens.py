@@ -308,7 +308,13 @@ class Lens(LensRays, InStates, nn.Module):
             if surface.coating is not None:
                 own = _stored_or_given(surface.coating, values, f"surfaces.{number}.coating.")
                 coating = surface.coating.state(own)
-            state = SurfaceState(type(surface), parameters, aperture, edge, law, coating)
+            relief = None
+            if surface.diffractive is not None:
+                own = _stored_or_given(
+                    surface.diffractive, values, f"surfaces.{number}.diffractive."
+                )
+                relief = surface.diffractive.state(own)
+            state = SurfaceState(type(surface), parameters, aperture, edge, law, coating, relief)
             astigmatism = astigmatism_of(self, number, values) if values else None
             surfaces.append(irregular(state, astigmatism) if astigmatism else state)
         thicknesses = [

@@ -63,7 +63,7 @@ def unit_of(name: str) -> Unit:
     first, _, _ = name.partition(".")
     group, _, last = name.rpartition(".")
     others = UNNAMED
-    if group.endswith(".coating"):
+    if group.endswith((".coating", ".diffractive")):
         return NANOMETRE
     if group.endswith(".phase"):
         # Zernike's coefficients are waves, all others radians.

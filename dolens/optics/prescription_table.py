@@ -110,6 +110,7 @@ class PrescriptionTable:
         sensor_radius: mm, of a curved sensor; `inf` of a plane one.
         sensor_conic: its conic constant; 0 of a sphere.
         coatings: what a coating is, in words → the surfaces that have it.
+        diffractive: number of a surface → its diffractive element, in words.
     """
 
     name: str
@@ -124,6 +125,7 @@ class PrescriptionTable:
     sensor_radius: float = math.inf
     sensor_conic: float = 0.0
     coatings: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    diffractive: dict[int, str] = field(default_factory=dict)
 
     @property
     def heading(self) -> str:
@@ -138,6 +140,9 @@ class PrescriptionTable:
         found = [
             printable(f"coating of {_surfaces(numbers)}: {coating}")
             for coating, numbers in self.coatings.items()
+        ]
+        found += [
+            f"diffractive element of surface {n}: {said}" for n, said in self.diffractive.items()
         ]
         for name, pose in self.elements.items():
             first, last = self.carried[name]
@@ -226,6 +231,11 @@ def prescription_table(lens: Any) -> PrescriptionTable:
         carried,
         *_sensor_shape(lens),
         _coatings(lens),
+        {
+            number: surface.diffractive.description
+            for number, surface in enumerate(lens.surfaces.values(), 1)
+            if surface.diffractive is not None
+        },
     )
 
 

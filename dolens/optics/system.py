@@ -110,6 +110,11 @@ class OpticalSystem:
         """Return whether a surface has a coating, so that light which passes has lost some."""
         return any(surface.coating is not None for surface in self.surfaces)
 
+    @cached_property
+    def diffractive(self) -> tuple[int, ...]:
+        """Return the numbers of the surfaces with a relief, which waves see and rays do not."""
+        return tuple(n for n, s in enumerate(self.surfaces, 1) if s.relief is not None)
+
     def uncoated(self) -> "OpticalSystem":
         """Return the same lens, whose surfaces are ideal."""
         if not self.coated:
@@ -400,7 +405,9 @@ def _places(lens: nn.Module) -> _Places:
     modules: Any = lens._modules
     surfaces = tuple(modules["surfaces"]._modules.values())
     elements = tuple(modules["elements"]._modules.values())
-    parts = (part for s in surfaces for part in (s.phase, s.coating) if part is not None)
+    parts = (
+        part for s in surfaces for part in (s.phase, s.coating, s.diffractive) if part is not None
+    )
     tables = [modules[name]._modules for name in ("surfaces", "elements")]
     for module in (modules["thicknesses"], *surfaces, *parts, *elements):
         tables += (module._parameters, module._buffers, module._modules)
@@ -425,6 +432,8 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
                 tensors += surface.deflection.parameters.values()
             if surface.coating is not None:
                 tensors += surface.coating.tensors
+            if surface.relief is not None and surface.relief.heights is not None:
+                tensors.append(surface.relief.heights)
     for element in system.elements:
         tensors += element.parameters.values()
     return all(id(tensor) in stored for tensor in tensors)

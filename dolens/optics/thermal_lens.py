@@ -44,7 +44,7 @@ _ASPHERIC = re.compile(r"a(\d+)")
 _LENGTH = re.compile(r"[zq]\d+")
 # Radians and nanometres of these stay as they are: a film is held by the glass, and grows by less
 # than its thickness is known.
-_FIXED = ("phase.", "coating.")
+_FIXED = ("phase.", "coating.", "diffractive.")
 
 
 def medium_at(medium: Medium, environment: Environment | None) -> Medium:

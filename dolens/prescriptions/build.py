@@ -20,6 +20,7 @@ are negative until the next mirror.  Rows of type `coordinate_break` move and tu
 that stands behind them (see row_data.py).
 A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
 lens (see row_data.py).  Which share of the light passes is said by its `coating` (see coatings.py).
+A plane surface may be a `diffractive` element, whose relief waves see (see diffractive.py).
 `thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
@@ -53,6 +54,11 @@ from dolens.prescriptions.coatings import (
     coating_from,
     coating_row,
     coatings_for,
+)
+from dolens.prescriptions.diffractive import (
+    DIFFRACTIVE_KEY,
+    diffractive_from,
+    diffractive_row,
 )
 from dolens.prescriptions.numbers import (
     as_integer,
@@ -116,6 +122,7 @@ _LENS_KEYS = (
 )
 _SURFACE_KEYS = (
     *("type", "radius", *APERTURE_KEYS, PHASE_KEY, COATING_KEY, "thickness"),
+    DIFFRACTIVE_KEY,
     *("material", EXPANSION_KEY, "note"),
 )
 
@@ -172,6 +179,11 @@ def lens_from_prescription(
             if given is not None:
                 surfaces[-1].coating = coating_from(given, place, model, air, dtype)
                 check_coating(surfaces[-1].coating, materials[-1], place)
+            given = row.get(DIFFRACTIVE_KEY)
+            if given is not None:
+                surfaces[-1].diffractive = diffractive_from(
+                    given, surfaces[-1], (materials[-2], materials[-1]), place, model, air, dtype
+                )
         expansions.append(expansion_of(row, materials[-1], place))
         if number < len(rows):
             if row.get("thickness") is None:
@@ -251,6 +263,8 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
             row[PHASE_KEY] = phase_row(surface.phase)
         if surface.coating is not None:
             row[COATING_KEY] = coating_row(surface.coating)
+        if surface.diffractive is not None:
+            row[DIFFRACTIVE_KEY] = diffractive_row(surface.diffractive)
         row |= aperture_rows(surface.aperture)
         row |= _gap(lens, number)
         row["material"] = material.name

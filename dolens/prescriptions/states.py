@@ -49,7 +49,16 @@ _AIR = ("temperature", "pressure")
 _DATA = ("fields", "object_distance", *_WAVES, *PUPIL_KEYS, PUBLISHED_KEY)
 _KEYS = ("surfaces", "sensor", *_DATA, *_AIR)
 # What a row of a surface says that is no number of it.
-_STRUCTURE = ("type", "material", "phase", "coating", "thermal_expansion", "note", "order")
+_STRUCTURE = (
+    "type",
+    "material",
+    "phase",
+    "coating",
+    "diffractive",
+    "thermal_expansion",
+    "note",
+    "order",
+)
 _RADIANS = "_radians"
 
 Build = Callable[[Mapping[str, Any], str], Lens]

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.diffraction.element_waves import element_light
+from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pixel_psf import (
     PixelWindow,
     propagation,
@@ -149,7 +151,8 @@ def wave_point_spread_functions(
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
 
     Each function keeps the share of light that rays give it; what diffraction spreads beyond the
-    window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
+    window is given back in proportion, but for a diffractive element's, whose other orders are lost
+    there.  Arguments as of `field_point_spread_functions`, and how
     finely diffraction is computed.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
@@ -161,8 +164,14 @@ def wave_point_spread_functions(
     seen = plane_points(imaging, points, disc)
     light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
-    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
     lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
+    if system.diffractive:
+        # Other orders spread light beyond every window, which nothing gives back.
+        whole = element_light(system, ObjectPoints.at(places[0]), *places[1:]).fit.wavefront.flux
+        whole = whole.reshape(shape).to(total)
+        lost = torch.where(whole > 0.0, 1.0 - total / whole, 0.0).detach().max()
+        total = whole
+    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
     return FieldPointSpreadFunctions(kernels * share[..., None, None], light[:, 0], lost)
 
 

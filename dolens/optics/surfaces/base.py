@@ -25,6 +25,7 @@ from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
 
 if TYPE_CHECKING:
     from dolens.optics.coatings import Coating
+    from dolens.optics.diffractive import DiffractiveElement
     from dolens.optics.surfaces.deflection import Law
     from dolens.optics.surfaces.phase import Phase
 
@@ -166,6 +167,7 @@ class Surface(nn.Module):
             `dolens.optics.surfaces.deflection`.
         phase: a grating or a diffractive lens on this surface, or None.
         coating: what decides which share of the light passes, or None: all of it.
+        diffractive: the relief of a diffractive element, which waves see and rays do not, or None.
     """
 
     kind: ClassVar[str] = ""
@@ -181,6 +183,7 @@ class Surface(nn.Module):
     law: ClassVar["type[Law] | None"] = None
     phase: "Phase | None"
     coating: "Coating | None"
+    diffractive: "DiffractiveElement | None"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -201,6 +204,7 @@ class Surface(nn.Module):
         self.aperture = aperture
         self.phase = None
         self.coating = None
+        self.diffractive = None
         for name, value in parameters.items():
             tensor = tensor_of(value, name, dtype)
             if name in self.constants:

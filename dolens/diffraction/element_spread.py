@@ -1,0 +1,130 @@
+"""Point spread functions of lenses with a diffractive element, of all its orders together."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.spot_diagram import AIRY
+from dolens.diffraction.element_waves import ElementLight, element_light
+from dolens.diffraction.field_wavefronts import object_points
+from dolens.diffraction.propagation import DiffractionSettings
+from dolens.diffraction.reference_sphere import find_chief_rays
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# A window holds the rays, as far as so many Airy radii, and so many around them.
+_RAYS, _BEYOND = 32.0, 8.0
+# Fewest steps of the irradiance's grid in a period of its finest detail, and most in a cell.
+_STEPS, _MOST = 2.0, 16
+# Cells of a second computation, over those of the first.
+_FINER = 1.3
+
+
+def field_lights(
+    lens: Lens, where: Conditions, settings: DiffractionSettings | None = None
+) -> list[ElementLight]:
+    """Trace the light of every field, of W wavelengths, to the diffractive element of a lens.
+
+    The window of a field is about the chief ray of the lens's primary wavelength, in rays' order.
+
+    Args:
+        lens: the lens.
+        where: fields, wavelengths and object distance.
+        settings: how finely; None: the default.
+
+    Raises:
+        InputError: the lens is none whose element waves can pass, or a chief ray does not arrive.
+    """
+    system, waves = lens.system().double(), where.wavelengths
+    found = []
+    for number, field in enumerate(where.fields.to(system.device)):
+        point = object_points(field[None], where.object_distance)
+        primary = torch.tensor([lens.primary_wavelength]).to(field)
+        centre, reached = find_chief_rays(system, point, primary)
+        if not bool(reached.all()):
+            raise InputError(f"the chief ray of field {number + 1} does not reach the sensor")
+        points = object_points(field.expand(len(waves), 2), where.object_distance)
+        found.append(element_light(system, points, waves, centre.expand(len(waves), 2), settings))
+    return found
+
+
+def element_airy_radius_um(light: ElementLight, weights: Tensor) -> float:
+    """Return 1.22·λ·d/D, µm, with D the width of the light on the element and d the reduced
+    distance to the sensor; mean over wavelengths.
+    """
+    radii = [
+        AIRY * float(light.fit.wavefront.wavelength[n]) * light.f_number(n)
+        for n in range(len(light))
+    ]
+    share = weights / weights.sum()
+    return 1e-3 * float(share.cpu() @ torch.tensor(radii, dtype=torch.float64))
+
+
+def element_half_width(light: ElementLight, airy: float) -> float:
+    """Return the half width, mm, of a window that holds rays' order and some rings around it.
+
+    Args:
+        light: of one field.
+        airy: radius, mm.
+    """
+    rays = max(light.ray_radius(n) for n in range(len(light)))
+    return min(rays, _RAYS * airy) + _BEYOND * airy
+
+
+@torch.no_grad()
+def mean_irradiance(
+    light: ElementLight, weights: Tensor, half: float, cells: int
+) -> tuple[Tensor, float, float]:
+    """Return the irradiance of a field, of all wavelengths.
+
+    Args:
+        light: of W wavelengths.
+        weights: (W,), of these.
+        half: half width of the window, mm.
+        cells: M, along each side.
+
+    Returns:
+        Means over the cells (M, M), share of the light per mm²; the highest irradiance, and that of
+        the same light if all of it met in phase at the centre, 1/mm².
+    """
+    flux = light.fit.wavefront.flux.cpu()
+    share = weights.cpu() / (weights.cpu() @ flux)
+    plans = [light.plan(n, half) for n in range(len(light))]
+    finest = max(plan.band for plan in plans)
+    parts = max(1, min(math.ceil(2.0 * half / cells * finest * _STEPS), _MOST))
+    fine = parts * cells
+    grid = (torch.arange(fine).to(light.centre) + 0.5) * (2.0 * half / fine) - half
+
+    def added(x: Tensor, y: Tensor) -> Tensor:
+        total = torch.zeros(len(y), len(x), dtype=torch.float64)
+        for n, plan in enumerate(plans):
+            field = light.field(n, plan, x, y, torch.float32).cpu()
+            total += float(share[n]) * (field.real.double() ** 2 + field.imag.double() ** 2)
+        return total
+
+    whole = added(grid, grid)
+    perfect = sum(float(share[n]) * light.perfect(n, plan) for n, plan in enumerate(plans))
+    # The highest point lies between the samples.
+    row, column = divmod(int(whole.argmax()), fine)
+    near = torch.linspace(-1.0, 1.0, 9).to(grid) * (2.0 * half / fine)
+    peak = float(added(grid[column] + near, grid[row] + near).amax())
+    means = whole.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
+    return means, peak, perfect
+
+
+@torch.no_grad()
+def element_sampling_error(light: ElementLight, weights: Tensor, half: float, cells: int) -> float:
+    """Return the largest change of the irradiance by a second computation on a finer grid of the
+    element (pixels in two), over its peak; NaN where that has too many cells.
+    """
+    coarse, *_ = mean_irradiance(light, weights, half, cells)
+    count = max(light.plan(n, half).count for n in range(len(light)))
+    settings = replace(light.settings, samples=math.ceil(_FINER * count))
+    try:
+        finer, *_ = mean_irradiance(replace(light, settings=settings), weights, half, cells)
+    except InputError:
+        return math.nan
+    return float((finer - coarse).abs().amax() / finer.amax())

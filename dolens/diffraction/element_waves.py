@@ -1,0 +1,508 @@
+"""A diffractive element as the last that has power: rays bring the wavefront, waves leave.
+
+The lens is cut at the element.  Rays to its plane give path and amplitude of every object point as
+polynomials (see `dolens.diffraction.pupil_fit`), the relief multiplies the field on a grid that is
+aligned with its pixels, and free space, or plane plates, carry it to the sensor (see
+`dolens.diffraction.free_space`).  Rays' own order of the element bends nothing here: the relief
+does, into all its orders.
+
+A pixel that is one cell of the grid is a small aperture: light that it turns by Δ (in n·sin) has
+the amplitude sinc(Δ·pitch/λ) along each axis, which is taken towards the middle of the window.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.free_space import (
+    Layer,
+    PlaneField,
+    by_fourier,
+    by_spectrum,
+    by_summation,
+    fourier_error,
+    on_grid,
+    reduced_distance,
+    to_centre,
+)
+from dolens.diffraction.propagation import DiffractionSettings
+from dolens.diffraction.pupil_fit import (
+    PupilFit,
+    RegularPupil,
+    chebyshev,
+    fit_pupil,
+    regular_pupil,
+)
+from dolens.diffraction.reference_sphere import chief_ray_intercepts
+from dolens.diffraction.wavefront import MM_PER_NM, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.diffractive import PhaseOnGrid, Relief, transmission
+from dolens.optics.surfaces.phase import Phase
+from dolens.optics.surfaces.state import LawState
+from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
+
+# Degree of the polynomials that rays are fitted by.
+_DEGREE = 10
+# Cells to a turn of the phase, to a ring or zone, by the settings' `oversampling` of two; fewest
+# and most cells along a side.
+_TWO, _FEWEST, _MOST = 2.0, 96, 4096
+# Of the settings' phase error, what one Fourier transform may make.
+_SHARE = 0.5
+# Points that say how steep phases are, and cells that find the light's edge, along each side.
+_COARSE, _SEARCH = 33, 128
+
+
+def element_number(system: OpticalSystem) -> int:
+    """Return the number of the surface whose relief waves pass, the only one.
+
+    Raises:
+        InputError: one line that says which of the conditions of this module a lens does not meet.
+    """
+    what = "diffractive element"
+    found = system.diffractive
+    if len(found) != 1:
+        raise InputError(f"{what}: waves pass one, and there are {len(found)}: surfaces {found}")
+    number = found[0]
+    require_refracting(system, what)
+    require_plane_sensor(system, what)
+    if system.stop > number:
+        raise InputError(f"{what}: the stop, surface {system.stop}, stands behind surface {number}")
+    if any(element.last >= number for element in system.elements):
+        raise InputError(f"{what}: surface {number}, or one behind it, belongs to a moved element")
+    for at in range(number + 1, len(system.surfaces) + 1):
+        surface = system.surfaces[at - 1]
+        if surface.shape.kind not in ("plane", "aperture") or surface.deflection is not None:
+            raise InputError(
+                f"{what}: surface {at} behind surface {number} is no plane; waves go from an "
+                "element to the sensor through plane plates only (rays' order alone: `phase`)"
+            )
+    return number
+
+
+def cut_at(system: OpticalSystem, number: int) -> OpticalSystem:
+    """Return a lens that ends on one of its surfaces, which refracts and does nothing else."""
+    surfaces = [*system.surfaces[: number - 1]]
+    surfaces.append(replace(system.surfaces[number - 1], deflection=None, relief=None))
+    return replace(
+        system,
+        surfaces=surfaces,
+        thicknesses=list(system.thicknesses[: number - 1]),
+        sensor_distance=torch.zeros_like(system.sensor_distance),
+        materials=system.materials[: number + 1],
+        index_offsets=tuple(system.index_offsets[: number + 1]),
+    )
+
+
+@dataclass(frozen=True)
+class ElementLight:
+    """The light of N object points on the plane of an element, and its way to windows.
+
+    Attributes:
+        fit: of paths and amplitudes, in mm on the element in the place of direction cosines.
+        relief: of the element.
+        law: of its phase, or None.
+        thicknesses: of the media behind the element, to the sensor, mm.
+        number: of the surface.
+        system: the lens.
+        centre: (N, 2), mm on the sensor, of the windows.
+        settings: how finely.
+    """
+
+    fit: PupilFit
+    relief: Relief
+    law: LawState | None
+    thicknesses: tuple[Tensor, ...]
+    number: int
+    system: OpticalSystem
+    centre: Tensor
+    settings: DiffractionSettings
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.centre)
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """Return what a field is differentiable in, in the order of `with_tensors`."""
+        clipping = self.fit.wavefront.clipping.values()
+        found = [self.fit.coefficients, *self.thicknesses]
+        found += [s.edge for s in clipping if s.edge is not None]
+        found += [] if self.law is None else self.law.parameters.values()
+        return found + ([] if self.relief.heights is None else [self.relief.heights])
+
+    def with_tensors(self, values: Sequence[Tensor]) -> "ElementLight":
+        """Return the same light with other tensors."""
+        left = list(values)
+        coefficients = left.pop(0)
+        thicknesses = tuple(left.pop(0) for _ in self.thicknesses)
+        clipping = {
+            n: s if s.edge is None else replace(s, edge=left.pop(0))
+            for n, s in self.fit.wavefront.clipping.items()
+        }
+        law = self.law
+        if law is not None:
+            law = replace(law, parameters={name: left.pop(0) for name in law.parameters})
+        relief = replace(self.relief, heights=left.pop(0)) if left else self.relief
+        fit = replace(
+            self.fit,
+            coefficients=coefficients,
+            wavefront=replace(self.fit.wavefront, clipping=clipping),
+        )
+        return replace(self, fit=fit, thicknesses=thicknesses, law=law, relief=relief)
+
+    def layers(self, n: int) -> list[Layer]:
+        """Return the layers between the element and the sensor, at a point's wavelength."""
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        indices = [float(self.system.indices(wavelength)[k]) for k in self._behind]
+        pairs = zip(self.thicknesses, indices, strict=True)
+        return [Layer(thickness, index) for thickness, index in pairs]
+
+    @cached_property
+    def _behind(self) -> range:
+        return range(self.number, len(self.system.materials))
+
+    @torch.no_grad()
+    def plan(self, n: int, half_window: float) -> "Plan":
+        """Return method, grid and errors of one point's light.
+
+        Args:
+            n: number of the point.
+            half_window: mm, from the window's centre to its sides.
+
+        Raises:
+            InputError: more cells are needed than can be computed.
+        """
+        fit, relief, settings = self.fit, self.relief, self.settings
+        low, high = self._lit(n)
+        wavelength, layers = float(fit.wavefront.wavelength[n]), self.layers(n)
+        wave, centre = MM_PER_NM * wavelength, self.centre[n].tolist()
+        x, y = _coarse(low, high)
+        error = math.inf
+        if len(layers) == 1:
+            error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
+        method = settings.method
+        if method == "auto":
+            method = "fourier" if error <= _SHARE * settings.phase_error else "spectrum"
+        if method != "spectrum" and len(layers) > 1:
+            raise InputError(f"method {method}: there are plates behind; allowed: spectrum")
+        slopes = torch.stack(_slopes(fit, n, x, y))
+        behind, lit = self._turned(n, x, y)
+        carrier = slopes[:, lit].mean(-1)
+        towards = _towards(x, y, centre, layers)
+        left = behind - (towards if method == "fourier" else carrier[:, None, None])
+        turned = behind - slopes
+        if self.law is not None:
+            turned = turned / round(float(self.law.parameters["order"]))
+        steepest = float(torch.where(lit, torch.maximum(left.abs(), turned.abs()), 0.0).max())
+        width = float((high - low).max())
+        cells = _TWO * settings.oversampling
+        finest = min(wave / (cells * max(steepest, 1e-12)), width / (settings.samples or _FEWEST))
+        cell = finest
+        if relief.heights is not None:
+            own = relief.pitch if relief.pixelated else relief.pitch / cells
+            cell = own / max(1, math.ceil(own / finest - 1e-9))
+        count = math.ceil(width / cell) + 2
+        if count > _MOST:
+            raise InputError(
+                f"diffractive element: {count} cells of {1e3 * cell:.3g} µm across the light are "
+                f"needed, more than {_MOST}; a slower beam or larger pixels need fewer"
+            )
+        starts = []
+        for axis in (0, 1):
+            half = 0.0
+            if relief.heights is not None and relief.pixelated:
+                # Edges of pixels fall on edges of cells.
+                half = 0.5 * relief.pitch * relief.heights.shape[1 - axis]
+            middle = 0.5 * float(low[axis] + high[axis])
+            starts.append(round((middle + half) / cell - 0.5 * count) * cell - half)
+        reach = width + 2.0 * half_window
+        band = min(1.0 / cell, reach / (wave * float(reduced_distance(layers))))
+        tilt = float(carrier[0]), float(carrier[1])
+        return Plan(method, error, cell, count, (starts[0], starts[1]), tilt, band)
+
+    def _lit(self, n: int) -> tuple[Tensor, Tensor]:
+        """Return the corners (2,) of a box that holds the light of a point, mm; no gradient."""
+        low, high = self.fit.low[n], self.fit.high[n]
+        side = (high - low).amax() / _SEARCH
+        start = float(low[0]), float(low[1])
+        plan = Plan("", 0.0, float(side), _SEARCH, start, (0.0, 0.0), 0.0)
+        lit = self._pupil(n, plan, (0.0, 0.0), torch.float64).amplitude[0] > 0.0
+        if not bool(lit.any()):
+            return low, high
+        ends = [lit.any(dim).nonzero().flatten()[[0, -1]] for dim in (0, 1)]
+        first, last = torch.stack(ends).to(low).unbind(1)
+        return low + side * (first - 1.0), low + side * (last + 2.0)
+
+    @torch.no_grad()
+    def f_number(self, n: int) -> float:
+        """Return the reduced distance to the sensor over the width of a point's light."""
+        low, high = self._lit(n)
+        return float(reduced_distance(self.layers(n))) / float((high - low).max())
+
+    @torch.no_grad()
+    def ray_radius(self, n: int) -> float:
+        """Return how far from the window's centre rays' order lands, mm: √2 of the RMS, which is
+        the edge of an even disc.
+        """
+        low, high = self._lit(n)
+        x, y = _coarse(low, high)
+        slopes, lit = self._turned(n, x, y)
+        spread = torch.zeros((), dtype=torch.float64)
+        ways = [(x - self.centre[n, 0])[None].expand_as(lit), (y - self.centre[n, 1])[:, None]]
+        for layer in self.layers(n):
+            normal = (layer.index**2 - slopes.square().sum(0)).clamp(min=1e-6).sqrt()
+            ways = [
+                way + float(layer.thickness) * slope / normal
+                for way, slope in zip(ways, slopes, strict=True)
+            ]
+        for way in ways:
+            spread = spread + way[lit].square().mean()
+        return math.sqrt(2.0 * float(spread))
+
+    def _turned(self, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return n·sin of rays' order behind the element (2, Y, X), and where light may be."""
+        slopes = torch.stack(_slopes(self.fit, n, x, y))
+        inside = (x[None] - x.mean()).square() / (x[-1] - x.mean()).square()
+        inside = inside + ((y - y.mean()).square() / (y[-1] - y.mean()).square())[:, None]
+        if self.law is not None:
+            phase = _phase(self.law, x, y)
+            wave = MM_PER_NM * float(self.fit.wavefront.wavelength[n])
+            slopes = slopes + torch.stack(phase[1:3]) * (wave / (2.0 * math.pi))
+        return slopes, inside <= 1.0
+
+    @torch.no_grad()
+    def perfect(self, n: int, plan: "Plan") -> float:
+        """Return the irradiance, 1/mm², if all light of a point met in phase at the centre."""
+        pupil = self._pupil(n, plan, (0.0, 0.0), torch.float64)
+        far = reduced_distance(self.layers(n))
+        x, y = (at - c for at, c in zip(pupil.cosines[0], self.centre[n], strict=True))
+        gain = far / (x.square()[None] + y.square()[:, None] + far * far)
+        wave = MM_PER_NM * float(self.fit.wavefront.wavelength[n])
+        return float(((pupil.amplitude[0] * gain).sum() * plan.cell**2 / wave).square())
+
+    def field(self, n: int, plan: "Plan", u: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the field (V, U) of a point in its window; |U|² is flux per mm².
+
+        Args:
+            n: number of the point.
+            plan: of this point, for a window that holds these places.
+            u: (U,), mm from the window's centre, along x.
+            v: (V,), mm, along y.
+            dtype: of the sums; phases are formed in double precision.
+        """
+        layers, centre = self.layers(n), self.centre[n].tolist()
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        values, x, y = self.behind(n, plan, dtype)
+        carrier = (0.0, 0.0) if plan.method == "fourier" else plan.carrier
+        found = PlaneField(values, x, y, wavelength, carrier)
+        if plan.method == "fourier":
+            return by_fourier(found, layers[0], centre, u, v, focused=True)
+        if plan.method == "spectrum":
+            return by_spectrum(found, layers, centre, u, v)
+        rows, columns = torch.meshgrid(v + centre[1], u + centre[0], indexing="ij")
+        return by_summation(found, layers[0], columns.flatten(), rows.flatten()).reshape(rows.shape)
+
+    def behind(self, n: int, plan: "Plan", dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
+
+        The phase is less the carrier's tilt; for the method `fourier` it is that of the field times
+        exp(ikn·R), with R the distance to the window's centre.  Arguments as of `field`.
+        """
+        relief, layers, centre = self.relief, self.layers(n), self.centre[n].tolist()
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        wave = MM_PER_NM * wavelength
+        steps = (torch.arange(plan.count).to(self.centre) + 0.5) * plan.cell
+        x, y = steps + plan.start[0], steps + plan.start[1]
+        fourier = plan.method == "fourier"
+        pupil = self._pupil(n, plan, (0.0, 0.0) if fourier else plan.carrier, dtype)
+        turns, amplitude = pupil.opd[0], pupil.amplitude[0]
+        if fourier:
+            turns = turns + on_grid(
+                lambda x, y: _turns_to(x, y, layers[0], centre, wavelength), x, y, dtype
+            )
+        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
+        inside, around = relief.indices(front, after, wavelength)
+
+        def path(x: Tensor, y: Tensor) -> Tensor:
+            slope_x, slope_y = _slopes(self.fit, n, x, y)
+            square = slope_x.square() + slope_y.square()
+            normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
+            return (next(normal) - next(normal)) / wavelength
+
+        def turned(x: Tensor, y: Tensor) -> Tensor:
+            gain = torch.ones((), dtype=torch.float64)
+            towards = _towards(x, y, centre, layers)
+            for slope, to in zip(_slopes(self.fit, n, x, y), towards, strict=True):
+                gain = gain * torch.sinc((to - slope) * (plan.cell / wave))
+            return gain
+
+        phase = None if self.law is None else _phase(self.law, x, y)
+        passed = transmission(relief, x, y, on_grid(path, x, y, dtype), (front, after), phase)
+        if relief.pixelated:
+            amplitude = amplitude * on_grid(turned, x, y, dtype)
+        angle = (2.0 * math.pi) * (turns - turns.detach().round()).to(dtype)
+        values = torch.polar(amplitude.to(dtype), angle)
+        return values * passed.to(values.dtype), x, y
+
+    def _pupil(
+        self, n: int, plan: "Plan", carrier: tuple[float, float], dtype: torch.dtype
+    ) -> RegularPupil:
+        """Return amplitude and path (in turns, less a carrier's tilt) on a plan's grid."""
+        fit, wave = self.fit, MM_PER_NM * float(self.fit.wavefront.wavelength[n])
+        half = fit.half_width[n]
+        tilt = torch.zeros_like(fit.coefficients[n])
+        tilt[0, 0, 1], tilt[0, 1, 0] = (c * h for c, h in zip(carrier, half, strict=True))
+        table = fit.coefficients[n] - tilt
+        scale = torch.ones_like(tilt[:, :1, :1])
+        scale[0] = 1.0 / wave
+        low = torch.tensor([plan.start]).to(fit.low)
+        one = slice(n, n + 1)
+        front = fit.wavefront
+        return regular_pupil(
+            replace(
+                fit,
+                coefficients=(table * scale)[None].to(dtype),
+                centre=fit.centre[one].to(dtype),
+                half_width=fit.half_width[one].to(dtype),
+                radius=fit.radius[one].to(dtype),
+                low=low.to(dtype),
+                high=(low + plan.count * plan.cell).to(dtype),
+                wavefront=replace(
+                    front,
+                    coverage=front.coverage[one],
+                    wavelength=front.wavelength[one],
+                    index=front.index[one],
+                ),
+            ),
+            plan.count,
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the light of one point is computed.
+
+    Attributes:
+        method: `fourier`, `spectrum` or `direct`.
+        phase_error: waves, that `fourier` errs by at most; infinite behind plates.
+        cell: mm, of the grid on the element.
+        count: cells along each side.
+        start: mm, x and y where the grid begins.
+        carrier: tilt of the light that is taken out, n·sin.
+        band: cycles/mm, width of the field's band in the window.
+    """
+
+    method: str
+    phase_error: float
+    cell: float
+    count: int
+    start: tuple[float, float]
+    carrier: tuple[float, float]
+    band: float
+
+    @property
+    def reason(self) -> str:
+        """Return the choice in words."""
+        return (
+            f"{self.method}: {self.count} × {self.count} cells of {1e3 * self.cell:.3g} µm on a "
+            f"diffractive element; one Fourier transform errs by {self.phase_error:.2g} waves"
+        )
+
+
+def element_light(
+    system: OpticalSystem,
+    points: ObjectPoints,
+    wavelength: float | Sequence[float] | Tensor,
+    centres: Sequence[Sequence[float]] | Tensor | None = None,
+    settings: DiffractionSettings | None = None,
+) -> ElementLight:
+    """Trace the light of object points to the diffractive element of a lens.
+
+    Args:
+        system: `lens.system(values)`.
+        points: N of them.
+        wavelength: nm, one or N.
+        centres: (N, 2), mm on the sensor, of windows; None: where the chief rays of rays' order
+            land.
+        settings: how finely; None: the default.
+
+    Raises:
+        InputError: no element, or one that waves cannot pass as `element_number` says.
+    """
+    settings = settings or DiffractionSettings()
+    system = system.double()
+    number = element_number(system)
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
+    points = points.to(**options)
+    waves = torch.as_tensor(wavelength, **options).detach().expand(len(points))
+    if centres is None:
+        centres = chief_ray_intercepts(system, points, waves)
+    centre = torch.as_tensor(centres, **options).detach()
+    if centre.shape != (len(points), 2):
+        raise InputError(f"centres must be ({len(points)}, 2) in mm, not {tuple(centre.shape)}")
+    middle = torch.zeros_like(points.slopes)
+    front = pupil_wavefront(
+        cut_at(system, number), points, waves, middle, settings.rays, on_sensor=True
+    )
+    surface = system.surfaces[number - 1]
+    gaps = (*system.thicknesses, system.sensor_distance)[number - 1 :]
+    assert surface.relief is not None
+    return ElementLight(
+        fit_pupil(front, _DEGREE),
+        surface.relief,
+        surface.deflection,
+        tuple(gaps),
+        number,
+        system,
+        centre,
+        settings,
+    )
+
+
+def _coarse(low: Tensor, high: Tensor) -> list[Tensor]:
+    """Return columns and rows of a few points between corners (2,)."""
+    ends = zip(low.tolist(), high.tolist(), strict=True)
+    return [torch.linspace(a, b, _COARSE).to(low) for a, b in ends]
+
+
+def _slopes(fit: PupilFit, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return ∂OPD/∂x and ∂OPD/∂y (Y, X), the wavevector along the element over 2π/λ."""
+    table = fit.coefficients[n, 0]
+    degree = table.shape[-1] - 1
+    (a, da), (b, db) = (
+        [t[0] for t in chebyshev(((at.flatten() - middle) / half).clamp(-1.0, 1.0)[None], degree)]
+        for at, middle, half in zip((x, y), fit.centre[n], fit.half_width[n], strict=True)
+    )
+    half = fit.half_width[n]
+    return (b.mT @ table @ da) / half[0], (db.mT @ table @ a) / half[1]
+
+
+def _turns_to(
+    x: Tensor, y: Tensor, layer: Layer, centre: Sequence[float], wavelength: float
+) -> Tensor:
+    """Return n·(R - z)/λ of places to a window's centre, as `to_centre` has it."""
+    return to_centre(x.flatten(), y.flatten(), layer, centre, wavelength)[0]
+
+
+def _phase(law: LawState, x: Tensor, y: Tensor) -> PhaseOnGrid:
+    """Return the phase of rays' order on a grid (Y, X)."""
+    kind = law.law
+    assert issubclass(kind, Phase)
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    found = kind.phase_and_gradient(law.parameters, columns, rows)
+    return PhaseOnGrid(*found, round(float(law.parameters["order"].detach())))
+
+
+def _towards(x: Tensor, y: Tensor, centre: Sequence[float], layers: Sequence[Layer]) -> Tensor:
+    """Return n·sin of the way from columns x and rows y to a window's centre, (2, Y, X)."""
+    far, index = reduced_distance(layers), layers[0].index if len(layers) == 1 else 1.0
+    across, down = (c - at.flatten() for c, at in zip(centre, (x, y), strict=True))
+    across, down = torch.broadcast_tensors(across[None], down[:, None])
+    distance = (across.square() + down.square() + (far * index) ** 2).sqrt()
+    return index * torch.stack((across, down)) / distance
