@@ -335,15 +335,24 @@ class ElementLight:
             normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
             return (next(normal) - next(normal)) / wavelength
 
-        def turned(x: Tensor, y: Tensor) -> Tensor:
+        def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
             gain = torch.ones((), dtype=torch.float64)
             towards = _towards(x, y, centre, layers)
             for slope, to in zip(_slopes(self.fit, n, x, y), towards, strict=True):
-                gain = gain * torch.sinc((to - slope) * (plan.cell / wave))
+                gain = gain * torch.sinc((to - slope) * (width / wave))
             return gain
 
+        def filled(x: Tensor, y: Tensor) -> Tensor:
+            fill = relief.fill
+            return fill * fill * turned(x, y, fill * plan.cell) / turned(x, y)
+
         phase = None if self.law is None else _phase(self.law, x, y)
-        passed = transmission(relief, x, y, on_grid(path, x, y, dtype), (front, after), phase)
+        # Of a pixel that is one cell, the part that its height fills turns light further.
+        whole = relief.pixelated and plan.cell > 0.99 * relief.pitch and relief.fill < 1.0
+        share = on_grid(filled, x, y, dtype) if whole else None
+        passed = transmission(
+            relief, x, y, on_grid(path, x, y, dtype), (front, after), phase, share
+        )
         if relief.pixelated:
             amplitude = amplitude * on_grid(turned, x, y, dtype)
         angle = (2.0 * math.pi) * (turns - turns.detach().round()).to(dtype)

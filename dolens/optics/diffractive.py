@@ -156,6 +156,7 @@ def transmission(
     path: Tensor | float,
     media: tuple[Medium, Medium],
     phase: PhaseOnGrid | None = None,
+    filled: Tensor | None = None,
 ) -> Tensor:
     """Return the complex transmission (Y, X) of a relief on the cells of a regular grid.
 
@@ -169,6 +170,8 @@ def transmission(
         path: turns per nm of height at each cell, Φ/(2π·h) of the module: (Y, X) or a number.
         media: in front of the surface and behind it.
         phase: of the surface, where it has one.
+        filled: (Y, X), part of a cell's amplitude that stands at its pixel's height, which depends
+            on where light goes; None: that part of its area.
     """
     cell = float((x[-1] - x[0]) / max(1, len(x) - 1))
     period = relief.period(1 if phase is None else phase.order, *media)
@@ -188,7 +191,8 @@ def transmission(
     if relief.fill < 1.0 and relief.heights is not None:
         rows, columns = relief.heights.shape
         down, across = _filled(relief, y, cell, rows), _filled(relief, x, cell, columns)
-        turned = 1.0 + (down[:, None] * across) * (turned - 1.0)
+        filled = down[:, None] * across if filled is None else filled
+        turned = 1.0 + filled * (turned - 1.0)
     return turned
 
 
