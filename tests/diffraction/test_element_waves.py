@@ -144,7 +144,10 @@ def test_pixels_make_what_brute_force_makes_of_them(field, fill):
     centre = [focal * s / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2) for s in sines]
     u = steps(7, 0.03)
     points = ObjectPoints.at_infinity([list(field)])
-    found = irradiance(lens, points, u, 550.0, [centre], method="spectrum").numpy()
+    # Gaps interfere by the light at the very rim, which a cell a pixel does not resolve.
+    samples = None if fill == 1.0 else 760
+    given = {"method": "spectrum", "samples": samples}
+    found = irradiance(lens, points, u, 550.0, [centre], **given).numpy()
     # Rayleigh and Sommerfeld's integral over parts of pixels, in NumPy.
     parts = 8
     x = (np.arange(count * parts) + 0.5 - 0.5 * count * parts) * (pitch / parts)
