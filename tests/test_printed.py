@@ -299,6 +299,7 @@ FRAGMENTS = {
     "docs/ghosts.md: variables:": partial(a_design, name="double_gauss"),
     "docs/glass.md: temperature: 60": a_lens,
     "docs/glass.md: surfaces:": a_lens,
+    "docs/glass.md: stop: 1": a_plain_lens,
     "docs/least_squares.md: variables:": a_design,
     "docs/states.md: f_number: 2.9": a_zoom,
     "docs/states.md: merit:": partial(a_design, name="published/zoom_us9784950_ex1"),

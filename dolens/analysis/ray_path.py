@@ -13,7 +13,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.surfaces.refraction import PlaneRay, tolerance_scale
 from dolens.optics.surfaces.state import SurfaceState
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_homogeneous
 from dolens.optics.text_tables import html_table, printable, text_table
 from dolens.optics.trace import (
     Meeting,
@@ -97,8 +97,9 @@ def ray_path(lens: Lens, rays: Rays) -> RayPath:
         rays: one ray, from the object towards the sensor.
 
     Raises:
-        InputError: more or fewer than one ray.
+        InputError: more or fewer than one ray, or a medium is a gradient, in which rays bend.
     """
+    require_homogeneous(lens.system(), "the path of one ray")
     components = rays.components()
     if components.x.numel() != 1:
         raise InputError(f"a path is that of one ray, not of {components.x.numel()}")

@@ -52,7 +52,8 @@ class LensSummary(FirstOrderNumbers):
         field_unit: `°` or `mm`.
         fields: of the lens.
         seidel_field: degrees or mm, the edge of the field that the sums are of.
-        seidel: sums of the lens, mm of wave aberration, by name.
+        seidel: sums of the lens, mm of wave aberration, by name; none where a medium is a gradient,
+            of which no sums hold.
         seidel_by_surface: the same of every surface.
     """
 
@@ -77,7 +78,7 @@ class LensSummary(FirstOrderNumbers):
         wave = 1e-3 * self.reference_wavelength
         return [
             [entry.name, entry.symbol, f"{1e3 * value:.4g}", f"{1e3 * value / wave:.3g}"]
-            for entry, value in zip(ABERRATIONS, self.seidel.values(), strict=True)
+            for entry, value in zip(ABERRATIONS, self.seidel.values(), strict=bool(self.seidel))
         ]
 
     def field_cells(self) -> list[list[str]]:
@@ -116,26 +117,27 @@ class LensSummary(FirstOrderNumbers):
 
     def __repr__(self) -> str:
         """Return the summary as text."""
-        note = [self.note] if self.note else []
+        note, cells = [self.note] if self.note else [], self.seidel_cells()
         return "\n\n".join(
             [
                 self.heading,
                 text_table(("first order", "", ""), self.first_order_cells(), {0, 2}),
                 *note,
                 text_table(self.field_headings, self.field_cells()),
-                text_table(self.seidel_headings, self.seidel_cells(), {0, 1}),
+                *([text_table(self.seidel_headings, cells, {0, 1})] if cells else []),
             ]
         )
 
     def _repr_html_(self) -> str:
         """Return the summary as HTML, all text escaped."""
+        cells = self.seidel_cells()
         return (
             html_table(
                 *(("first order", "", ""), self.first_order_cells(), self.heading, {0, 2}),
                 self.note,
             )
             + html_table(self.field_headings, self.field_cells())
-            + html_table(self.seidel_headings, self.seidel_cells(), left={0, 1})
+            + (html_table(self.seidel_headings, cells, left={0, 1}) if cells else "")
         )
 
 
@@ -144,7 +146,8 @@ def lens_summary(lens: Lens, given: Conditions) -> LensSummary:
     """Summarise a lens at given conditions."""
     exact = in_double_precision(lens)
     spots = spot_diagram(exact, given, _RAYS)
-    sums = seidel_sums(exact, given)
+    sums = None if exact.system().gradients else seidel_sums(exact, given)
+    by_surface = {} if sums is None else sums.by_surface._asdict()
     geo = spots.geo[:, spots.where.weights > 0.0].nan_to_num(-math.inf).amax(-1)
     first = first_order_numbers(exact, given)
     return LensSummary(
@@ -163,11 +166,11 @@ def lens_summary(lens: Lens, given: Conditions) -> LensSummary:
                 strict=True,
             )
         ),
-        seidel_field=sums.edge,
-        seidel={key: float(value) for key, value in sums.by_surface.total._asdict().items()},
+        seidel_field=math.nan if sums is None else sums.edge,
+        seidel={key: float(values.sum(-1)) for key, values in by_surface.items()},
         seidel_by_surface=tuple(
-            {key: float(values[at]) for key, values in sums.by_surface._asdict().items()}
-            for at in range(len(exact.surfaces))
+            {key: float(values[at]) for key, values in by_surface.items()}
+            for at in range(len(exact.surfaces) if by_surface else 0)
         ),
     )
 

@@ -23,6 +23,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_rays import ParaxialNumbers
+from dolens.optics.system import require_homogeneous
 from dolens.plotting.small_sections import SmallSection, form_section
 from dolens.plotting.tolerances import parameter_label
 from dolens.prescriptions.build import prescription_of
@@ -60,8 +61,13 @@ class ElementPower(NamedTuple):
 
 @torch.no_grad()
 def element_powers(lens: Lens) -> tuple[ElementPower, ...]:
-    """Return the powers of the elements of a centred lens, from the front."""
+    """Return the powers of the elements of a centred lens, from the front.
+
+    Raises:
+        InputError: a medium is a gradient.
+    """
     system = lens.system().double()
+    require_homogeneous(system, "powers of elements")
     wave = lens.primary_wavelength
     numbers = ParaxialNumbers.of(system)
     efl = float(lens.first_order(wave).efl)

@@ -348,7 +348,7 @@ def _line_spread(heights: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
 
 def _paths(system: OpticalSystem, ray: Components, wavelength: float) -> tuple[Tensor, Tensor]:
     """Return what `ray_paths` does, by kernels where light goes straight on along one axis."""
-    if system.breaks or system.elements or system.mirrors:
+    if system.breaks or system.elements or system.mirrors or system.gradients:
         return ray_paths(system, ray, wavelength)
     rays = step = Rays.from_components(ray, wavelength)
     points = [rays.position]

@@ -25,7 +25,7 @@ from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.state import SurfaceState
-from dolens.optics.system import OpticalSystem, require_isotropic
+from dolens.optics.system import OpticalSystem, require_homogeneous, require_isotropic
 
 Path = tuple[int, ...]
 # Paths of many reflections are too many to count.
@@ -41,7 +41,11 @@ def reflecting_surfaces(system: OpticalSystem, sensor: bool = False) -> tuple[in
     Args:
         system: the lens.
         sensor: whether the sensor reflects too; its number is one more than the last surface's.
+
+    Raises:
+        InputError: a medium is a gradient.
     """
+    require_homogeneous(system, "ghosts")
     count = len(system.surfaces)
     found = [n for n in range(1, count + 1) if _reflects(system, n)]
     return (*found, count + 1) if sensor else tuple(found)

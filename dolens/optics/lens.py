@@ -17,6 +17,7 @@ from dolens.optics.crystals import Uniaxial
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
+from dolens.optics.gradients import Gradient
 from dolens.optics.image_surface import image_surface, register_image_surface
 from dolens.optics.lens_data import LensData
 from dolens.optics.lens_rays import LensRays
@@ -55,6 +56,12 @@ def check_lens(
     if not 1 <= stop <= count:
         raise InputError(f"stop must be a surface from 1 to {count}, not {stop}")
     media = media_of(tuple(materials)).materials
+    for medium, where in ((media[0], "before the first"), (media[-1], "behind the last")):
+        if isinstance(medium, Gradient):
+            raise InputError(
+                f"the medium {where} surface cannot be a gradient; end it with a surface, which "
+                "may be a plane"
+            )
     for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
         if surface.law is not None and medium is MIRROR:
             raise InputError(f"surface {number}: a {surface.law.kind} cannot be a mirror")

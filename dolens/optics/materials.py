@@ -12,11 +12,12 @@ from typing import Any, NamedTuple, TypeGuard
 
 from torch import Tensor
 
-from dolens.errors import InputError, check_choice, comma_hint
+from dolens.errors import InputError, check_choice, comma_hint, did_you_mean
 from dolens.optics.crystals import RAYS, Uniaxial, unit_axis
 from dolens.optics.dispersion import ModelGlass, model_glass, require_wavelength
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.glass_catalog import find_glass
+from dolens.optics.gradients import TERMS, Gradient
 
 
 class Mirror:
@@ -148,7 +149,7 @@ class Material:
 
 # What light may travel through: hashable, equal when it is the same medium, and with a name that a
 # prescription reads back as the same.
-Medium = Material | ModelGlass | Glass | Mirror | Uniaxial
+Medium = Material | ModelGlass | Glass | Mirror | Uniaxial | Gradient
 
 # Names of what stands for a medium and is none but air.
 NO_GLASS = ("air", "occluder", MIRROR.name)
@@ -167,7 +168,8 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
         text: `air`; `occluder`; `mirror`, where a surface reflects; a number, the same index at
             every wavelength; glass as nd/Vd, for example `1.5168/64.17`, or as nd/Vd/ΔPgF (see
             `model_glass`); a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7` (see
-            `find_glass`); or a uniaxial crystal, for example `CALCITE extraordinary 0 1 1` (see
+            `find_glass`); one of these with a gradient, for example `gradient 1.6 r2=-0.001` (see
+            `Gradient`); or a uniaxial crystal, for example `CALCITE extraordinary 0 1 1` (see
             `Uniaxial`): the medium of its ordinary rays, which ray is followed, and the direction
             of its optic axis.  The medium of extraordinary rays has the name with `-E` behind it,
             or stands behind `and`: `1.658 and 1.486 ordinary 0 1 0`.  Case is ignored.
@@ -195,6 +197,8 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
         return _constant(name)
     if name.lower() == MIRROR.name:
         return MIRROR
+    if name.lower().split(maxsplit=1)[:1] in (["gradient"], ["gradient_squared"]):
+        return _gradient(name, model, environment)
     match = _GLASS.fullmatch(name)
     if comma_hint(name):
         raise InputError(f"material '{name}' must have numbers{comma_hint(name)}")
@@ -275,7 +279,7 @@ def _part_of(
         found = parse_material(part, model, environment)
     except InputError as error:
         raise InputError(f"material '{text}': {error}") from None
-    if isinstance(found, Mirror | Uniaxial):
+    if isinstance(found, Mirror | Uniaxial | Gradient):
         raise InputError(f"material '{text}': '{part}' is no medium with one index")
     return found
 
@@ -286,6 +290,32 @@ def _with_partial_dispersion(
     if not abs(deviation) <= LARGEST_DEVIATION:
         raise InputError(f"material '{name}': ΔPgF must be from -1 to 1 (glasses have about ±0.05)")
     return model_glass(name, nd, vd, deviation, model.lines)
+
+
+def _gradient(name: str, model: IndexModel, environment: Environment | None) -> Gradient:
+    kind, *words = name.split()
+    base = [word for word in words if "=" not in word]
+    if len(base) != 1 or len(words) < 2:
+        raise InputError(
+            f"material '{name}': write a medium and terms, such as gradient 1.6 r2=-0.001"
+        )
+    medium = _part_of(name, base[0], model, environment)
+    terms: dict[str, float] = {}
+    for word in words:
+        term, equals, value = word.lower().partition("=")
+        if not equals:
+            continue
+        if term not in TERMS or term in terms:
+            what = f"'{term}' is there twice" if term in terms else f"there is no term '{term}'"
+            raise InputError(
+                f"material '{name}': {what}{did_you_mean(term, TERMS)} "
+                f"(allowed: {', '.join(TERMS)})"
+            )
+        if not re.fullmatch(_SIGNED, value) or not math.isfinite(float(value)):
+            raise InputError(f"material '{name}': {term} must be a number, not '{value}'")
+        terms[term] = float(value)
+    ordered = tuple((term, terms[term]) for term in TERMS if term in terms)
+    return Gradient(medium, ordered, kind.lower() == "gradient_squared")
 
 
 def _constant(text: str) -> Material:

@@ -185,6 +185,8 @@ def unsupported(system: OpticalSystem) -> str | None:
     """Say why the kernels cannot trace a lens, naming the surface; None where they can."""
     if system.anisotropic:
         return f"medium {system.anisotropic[0]} is a crystal of extraordinary rays"
+    for place in system.gradients:
+        return f"the medium behind surface {place} is a gradient, which kernels do not trace"
     device = system.device.type
     if not any(_lacks_kernel(shape, law, device) for shape, law in system.kinds):
         return None

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.gradients import BentGap
 from dolens.optics.materials import is_anisotropic
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
@@ -54,8 +55,12 @@ class TwoRays(NamedTuple):
     nu: Number
     nu2: Number
 
-    def transferred(self, thickness: Number, index: Number) -> "TwoRays":
-        """The rays behind a gap of a medium."""
+    def transferred(self, thickness: Number | BentGap, index: Number) -> "TwoRays":
+        """The rays behind a gap of a medium, or of a gradient."""
+        if isinstance(thickness, BentGap):
+            a, b, c, d, _ = thickness
+            y, y2, nu, nu2 = self
+            return TwoRays(a * y + b * nu, a * y2 + b * nu2, c * y + d * nu, c * y2 + d * nu2)
         gap = thickness / index
         return TwoRays(self.y + gap * self.nu, self.y2 + gap * self.nu2, self.nu, self.nu2)
 
@@ -66,7 +71,7 @@ UNIT_RAYS = TwoRays(1.0, 0.0, 0.0, 1.0)
 def through_surfaces(
     rays: TwoRays,
     curvatures: Sequence[Number],
-    thicknesses: Sequence[Number],
+    thicknesses: Sequence[Number | BentGap],
     indices: Sequence[Number],
     powers: Sequence[Number] | None = None,
 ) -> Iterator[TwoRays]:
@@ -75,8 +80,8 @@ def through_surfaces(
     Args:
         rays: before the first surface, mm.
         curvatures: paraxial, of N surfaces, 1/mm.
-        thicknesses: of the N - 1 gaps between them, mm.
-        indices: of the N + 1 media around them.
+        thicknesses: of the N - 1 gaps between them, mm; of a gradient, what it does.
+        indices: of the N + 1 media around them; of a gradient, at its front.
         powers: of the N surfaces besides that of refraction, 1/mm; None: they have none.
 
     Yields:
@@ -86,8 +91,13 @@ def through_surfaces(
     for i, curvature in enumerate(curvatures):
         before, behind = indices[i], indices[i + 1]
         if i:
-            gap = thicknesses[i - 1] / before
-            y, y2 = y + gap * nu, y2 + gap * nu2
+            gap = thicknesses[i - 1]
+            if isinstance(gap, BentGap):
+                y, y2, nu, nu2 = TwoRays(y, y2, nu, nu2).transferred(gap, before)
+                before = gap.behind
+            else:
+                gap = gap / before
+                y, y2 = y + gap * nu, y2 + gap * nu2
         power = (behind - before) * curvature
         if powers is not None:
             power = power + powers[i]
@@ -97,7 +107,7 @@ def through_surfaces(
 
 def behind_surfaces(
     curvatures: Sequence[Number],
-    thicknesses: Sequence[Number],
+    thicknesses: Sequence[Number | BentGap],
     indices: Sequence[Number],
     powers: Sequence[Number] | None = None,
 ) -> TwoRays:
@@ -182,7 +192,7 @@ def _unit_rays_behind(
     """Trace the unit rays from just before surface `first` to just after `last`."""
     return behind_surfaces(
         curvatures_of(system, first, last),
-        system.thicknesses[first - 1 : max(last - 1, 0)],
+        system.paraxial_gaps(wavelength)[first - 1 : max(last - 1, 0)],
         system.signed_indices(wavelength)[first - 1 : last + 1],
         powers_of(system, wavelength, first, last),
     )
@@ -195,7 +205,7 @@ def matrix_to_stop(system: OpticalSystem, wavelength: float | Tensor) -> Tensor:
     rays = _unit_rays_behind(system, wavelength, 1, stop - 1)
     if stop > 1:
         index = system.signed_indices(wavelength)[stop - 1]
-        rays = rays.transferred(system.thicknesses[stop - 2], index)
+        rays = rays.transferred(system.paraxial_gaps(wavelength)[stop - 2], index)
     return _matrix(rays, system)
 
 

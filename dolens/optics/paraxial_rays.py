@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, change_axes
+from dolens.optics.gradients import BentGap, paraxial_gaps
 from dolens.optics.materials import Medium, is_anisotropic
 from dolens.optics.paraxial import (
     TwoRays,
@@ -29,7 +30,7 @@ from dolens.optics.rays import Components
 from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.ideal_lens import IdealLens
 from dolens.optics.surfaces.refraction import PlaneRay
-from dolens.optics.system import OpticalSystem, per_radian
+from dolens.optics.system import OpticalSystem, per_radian, require_homogeneous
 
 
 class ParaxialRay(NamedTuple):
@@ -94,7 +95,11 @@ def paraxial_rays(
         field: radians, the chief ray's slope being tan(field), for an object at infinity; else the
             height of the object point in mm, from which the chief ray comes down.
         object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
+
+    Raises:
+        InputError: a medium is a gradient, in which slopes change between surfaces.
     """
+    require_homogeneous(system, "paraxial rays, surface by surface")
     matrix = matrix_to_stop(system, wavelength)
     a, b = matrix[0, 0], matrix[0, 1]
     n = system.signed_indices(wavelength)
@@ -146,6 +151,7 @@ class ParaxialNumbers:
         powers: what each surface adds to the power of refraction, a constant (1/mm) and a
             coefficient of the wavelength (1/(mm nm)); None where none adds any.
         offsets: added to the index of each medium; () where nothing is.
+        gradients: places of gradients, and the surfaces that their profiles count from.
     """
 
     curvatures: tuple[Number, ...]
@@ -157,6 +163,7 @@ class ParaxialNumbers:
     senses: tuple[float, ...]
     powers: tuple[tuple[Number, Number], ...] | None = None
     offsets: tuple[Number, ...] = ()
+    gradients: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     @torch.no_grad()
@@ -200,6 +207,7 @@ class ParaxialNumbers:
             system.senses,
             _pairs(numbers[2 * count : 2 * count + powers]),
             tuple(numbers[2 * count + powers :]),
+            tuple(system.gradients.items()),
         )
 
     @property
@@ -232,7 +240,7 @@ class ParaxialNumbers:
         if self.stop == 1:
             return rays
         index = self._index(self.stop - 1, wavelength)
-        return rays.transferred(self.thicknesses[self.stop - 2], index)
+        return rays.transferred(self._gaps(wavelength)[self.stop - 2], index)
 
     def _unit_rays_behind(self, wavelength: float, first: int, last: int) -> TwoRays:
         """Trace the unit rays from just before surface `first` to just after `last`."""
@@ -247,7 +255,7 @@ class ParaxialNumbers:
             powers = [p + s * c for p, s, c in zip(own, steps, curvatures, strict=True)]
         return behind_surfaces(
             curvatures,
-            self.thicknesses[first - 1 : max(last - 1, 0)],
+            self._gaps(wavelength)[first - 1 : max(last - 1, 0)],
             [self._index(medium, wavelength) for medium in media],
             powers,
         )
@@ -259,6 +267,15 @@ class ParaxialNumbers:
             return 0.0
         difference = crystal.axial_index(wavelength) - crystal.index(wavelength)
         return self.senses[medium] * float(difference)
+
+    def _gaps(self, wavelength: float) -> Sequence[Number | BentGap]:
+        """Return the gaps as paraxial rays take them."""
+        if not self.gradients:
+            return self.thicknesses
+        indices = [self._index(place, wavelength) for place, _ in self.gradients]
+        return paraxial_gaps(
+            self.thicknesses, self.materials, dict(self.gradients), indices, self.senses
+        )
 
     def _index(self, medium: int, wavelength: float) -> Number:
         """Return a medium's index, negative where light travels towards -z."""
@@ -321,9 +338,8 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
     one = torch.ones_like(near)
     ray = TwoRays(one, 0.0 * one, index[0] * near, 0.0 * one)
     curvatures = [_or_plane(curvature) for curvature in curvatures_of(system)]
-    behind = list(
-        through_surfaces(ray, curvatures, system.thicknesses, index, powers_of(system, wavelength))
-    )
+    gaps, powers = system.paraxial_gaps(wavelength), powers_of(system, wavelength)
+    behind = list(through_surfaces(ray, curvatures, gaps, index, powers))
     surfaces = list(system.surfaces)
     for i in lenses:
         reduced = behind[i - 1].nu if i else ray.nu

@@ -20,13 +20,27 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.bent_rays import Space
 from dolens.optics.crystals import Crystal, turned_axis
 from dolens.optics.elements import Axes, ElementState, surface_axes
+from dolens.optics.gradients import (
+    BentGap,
+    Gradient,
+    gap_of_gradient,
+    paraxial_gaps,
+    plain,
+    steps_through,
+)
 from dolens.optics.materials import Medium, absorption, is_anisotropic
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
 from dolens.optics.surfaces.deflection import Law
 from dolens.optics.surfaces.state import SurfaceState
+
+Number = Any  # of Python's, or a tensor
+
+# A gradient's profile holds so many times as far as light is wanted.
+_REACH = 10.0
 
 
 def per_radian(wavelength: float | Tensor, like: Tensor) -> float | Tensor:
@@ -130,6 +144,44 @@ class OpticalSystem:
     def derived(self) -> dict[Hashable, Any]:
         """Hold what functions derive from the structure of this system, by keys of their own."""
         return {}
+
+    @cached_property
+    def gradients(self) -> dict[int, int]:
+        """Return the places of gradient-index media, from 0 before surface 1, and the numbers of
+        the surfaces that their profiles count from.
+        """
+        found: dict[int, int] = {}
+        for place, medium in enumerate(self.materials):
+            if isinstance(medium, Gradient):
+                within = place in self.mirrors or place in self.breaks
+                found[place] = found[place - 1] if within else place
+        return found
+
+    def spaces(self, wavelength: float | Tensor) -> dict[int, Space]:
+        """Return the gaps in which rays bend, by the place of their medium; wavelengths in nm."""
+        if not self.gradients:
+            return {}
+        indices, axes, found = self.indices(wavelength), self.axes, {}
+        for place, origin in self.gradients.items():
+            medium, n = self.materials[place], indices[place]
+            assert isinstance(medium, Gradient)  # as its place says
+            radius = max(s.semi_diameter for s in self.surfaces[place - 1 : place + 1])
+            start, length = map(plain, gap_of_gradient(self.thicknesses, origin, place))
+            steps = steps_through(medium, plain(n), start, length, radius, self.dtype)
+            reach = _REACH * (radius + abs(start) + abs(length))
+            found[place] = Space(medium, n, axes[origin - 1], steps, reach)
+        return found
+
+    def paraxial_gaps(self, wavelength: float | Tensor) -> list[Tensor | BentGap]:
+        """Return the gaps as paraxial rays take them: lengths (mm), and those of gradients."""
+        if not self.gradients:
+            return list(self.thicknesses)
+        signed = self.signed_indices(wavelength)
+        indices = [signed[place] for place in self.gradients]
+        return paraxial_gaps(
+            *(self.thicknesses, self.materials, self.gradients, indices, self.senses),
+            self.meridian,
+        )
 
     def refracts(self, number: int) -> bool:
         """Return whether a surface changes the direction of light, by refraction or reflection."""
@@ -423,7 +475,7 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
     """Return whether a system holds nothing that a call leaves behind: values that
     `functional_call` puts in the place of parameters, or numbers computed from parameters.
     """
-    stored = {id(part) for part in parts if isinstance(part, Tensor) and _is_plain(part)}
+    stored = {id(part) for part in parts if isinstance(part, Tensor) and _isplain(part)}
     tensors = [*system.thicknesses, system.sensor_distance]
     for surface in (*system.surfaces, system.image):
         if surface is not None:
@@ -439,7 +491,7 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
     return all(id(tensor) in stored for tensor in tensors)
 
 
-def _is_plain(tensor: Tensor) -> bool:
+def _isplain(tensor: Tensor) -> bool:
     """Return whether a tensor is a parameter, or a buffer without a graph."""
     if isinstance(tensor, nn.Parameter):
         return True
@@ -469,6 +521,15 @@ def require_isotropic(system: OpticalSystem, what: str) -> None:
         raise InputError(
             f"{what}: the medium behind surface {number} is a crystal of extraordinary rays "
             f"({system.materials[number].name}); only media with one index are held there"
+        )
+
+
+def require_homogeneous(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where a medium of a lens is a gradient; arguments as above."""
+    for place in system.gradients:
+        raise InputError(
+            f"{what}: the medium behind surface {place} has a gradient of its index, which is not "
+            "held there"
         )
 
 

@@ -23,6 +23,7 @@ from dolens.optics.glass import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environ
 from dolens.optics.materials import Medium, media_of
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
+from dolens.optics.system import require_homogeneous
 
 logger = logging.getLogger(__name__)
 
@@ -71,8 +72,9 @@ def lens_at(lens: Any, temperature: float, pressure: float | None = None) -> Any
 
     Raises:
         InputError: the temperature or pressure is impossible, or a surface has parameters that are
-            not known to expand.
+            not known to expand, or a medium is a gradient, of which neither is known.
     """
+    require_homogeneous(lens.system(), "another temperature")
     if pressure is None:
         pressure = STANDARD_PRESSURE if lens.pressure is None else lens.pressure
     environment = Environment(float(temperature), float(pressure))

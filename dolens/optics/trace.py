@@ -1,7 +1,7 @@
 """Sequential tracing, forward and backward (Algorithm 1 of the source)."""
 
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -239,6 +239,7 @@ def trace_surfaces(
     """
     indices, places, senses = system.indices(wavelength), system.axes, system.senses
     crystals = system.crystals(wavelength)
+    spaces = system.spaces(wavelength)
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
     shares: list[Shares] | None = [] if transmission else None
@@ -266,16 +267,25 @@ def trace_surfaces(
                 for k in (front, back)
             )
         arriving, leaving = sense * senses[front], sense * senses[back]
-        here, carried = change_axes(ray, axes, places[i])
+        towards = partial(meet, surface, sense=arriving, from_the_side=system.from_the_side)
+        bent = None
+        if front in spaces:
+            here, found, bent = spaces[front].cross(ray, axes, places[i], towards)
+            carried = None
+        else:
+            here, carried = change_axes(ray, axes, places[i])
+            found = towards(here)
         axes = places[i]
-        (x, y, z, l, m, n), to_plane, t, met = meet(  # noqa: E741
-            surface, here, arriving, system.from_the_side
-        )
+        (x, y, z, l, m, n), to_plane, t, met = found  # noqa: E741
+        if front in spaces:
+            before = spaces[front].index((x, y, z), axes)
+        if back in spaces:
+            after = spaces[back].index((x, y, z), axes)
         inside = surface.aperture.margin(x, y)
         if path is not None or shares is not None:
             distance = to_plane + t if carried is None else carried + to_plane + t
             along = before.ray_index((l, m, n)) if isinstance(before, Crystal) else before
-            path = None if path is None else path + along * distance
+            path = None if path is None else path + (along * distance if bent is None else bent)
         if record:
             points.append(points_to_lens_axes((x, y, z), axes))
         if shares is not None:

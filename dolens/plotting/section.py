@@ -18,7 +18,7 @@ from dolens.optics.surfaces import GRAZING
 from dolens.optics.surfaces.clear_aperture import Circle
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
+from dolens.optics.trace import Crossing, trace_surfaces, trace_to_sensor, transfer
 
 Profile = tuple[np.ndarray, np.ndarray]
 
@@ -103,6 +103,8 @@ _SEARCH = 1.5
 _TRIALS = 601
 # Heights on the stop whose rays are tried where the lens is folded.
 _STOP_TRIALS = 81
+# Points of a ray in a gradient.
+_BETWEEN = 24
 # Points of a curved sensor.
 _CURVE = 65
 _NOTHING: Profile = (np.zeros(0), np.zeros(0))
@@ -356,12 +358,21 @@ def ray_paths(
     system: OpticalSystem, ray: Components, wavelength: float | Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the points (..., points, 3) of rays in the lens's axes, mm: where they begin, on every
-    surface that light meets, on the sensor; and which reach it.
+    surface that light meets, on the sensor; and which reach it.  In gradients, where rays bend,
+    there are points between surfaces.
     """
-    traced = trace_surfaces(system, ray, wavelength, record=True)
+    crossings: list[Crossing] = []
+    traced = trace_surfaces(system, ray, wavelength, record=True, crossings=crossings)
     landed = trace_to_sensor(system, traced, wavelength)
     end = landed.ray._replace(z=landed.ray.z - system.vertices[-1])
-    met = [traced.points[number - 1] for number in system.met]
+    spaces, met = system.spaces(wavelength), []
+    for crossing, behind in zip(crossings, [*crossings[1:], None], strict=True):
+        met.append(traced.points[crossing.number - 1])
+        space = spaces.get(crossing.number)
+        if space is not None and behind is not None:
+            begin = Components(*crossing.point, *crossing.leaving)
+            onward = traced.points[behind.number - 1]
+            met += space.between(begin, crossing.axes, onward, _BETWEEN)
     points = [ray[:3], *met, points_to_lens_axes(end[:3], system.all_axes[-1])]
     return torch.stack([torch.stack(point, -1) for point in points], -2), landed.valid
 

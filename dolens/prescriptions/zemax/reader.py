@@ -58,6 +58,7 @@ from dolens.prescriptions.zemax.file import (
     parse_zemax,
 )
 from dolens.prescriptions.zemax.glass import read_glass
+from dolens.prescriptions.zemax.gradients import gradient_medium
 from dolens.prescriptions.zemax.passed_over import passed_over
 from dolens.prescriptions.zemax.shapes import shape_of_block
 from dolens.prescriptions.zemax.system import factor_to_mm, read_system, refuse_own_air
@@ -241,7 +242,7 @@ def _row(
     aperture: Row = {}
     clips = False
     if shape.surface:
-        material = glass(block.words("GLAS"), place=block.place)
+        material = gradient_medium(block) or glass(block.words("GLAS"), place=block.place)
         block = replace(block, material=material)
         row |= {"material": material, **coating(block)}
         sizing = block.stop and not pupil

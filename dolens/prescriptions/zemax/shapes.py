@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.elements import TILTS
+from dolens.optics.elements import TILTS as POSE_TILTS
 from dolens.optics.surfaces.coordinate_break import BREAK, DECENTERS
 from dolens.optics.surfaces.zernike import ZernikeFringe, ZernikeSag, ZernikeStandard
 from dolens.optics.surfaces.zernike_phase import (
@@ -21,6 +21,7 @@ from dolens.prescriptions.numbers import as_number, power_of
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
+from dolens.prescriptions.zemax.gradients import GRADIENTS, TILTS
 from dolens.prescriptions.zemax.table import (
     CONIC,
     ORDER,
@@ -105,7 +106,7 @@ def _read_break(shape: ZemaxShape, block: SurfaceBlock) -> Row:
 
 
 def _write_break(shape: ZemaxShape, row: Mapping[str, Any], place: str) -> list[str]:
-    for name in TILTS:
+    for name in POSE_TILTS:
         if f"{name}_radians" in row:
             raise InputError(
                 f"{place}: a .zmx file cannot hold '{name}_radians': no number of degrees means "
@@ -394,6 +395,19 @@ SHAPES = {
             own_write=lambda shape, row, place: [*shape.lines(row, place), *grid_lines(row, place)],
         ),
         JONES_MATRIX,
+        *(
+            replace(
+                STANDARD,
+                type=kind,
+                kinds=(),
+                kind="conic",
+                base=CONIC,
+                others=_parm(*range(1, 3 + len(terms))),
+                refused=TILTS if kind == "GRINSUR5" else {},
+                own_read=None,
+            )
+            for kind, terms in GRADIENTS.items()
+        ),
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
@@ -411,11 +425,11 @@ _NOT_HELD = {
     "ELLIPGRA": "an elliptical grating",
     "FRESNEL": "a Fresnel surface",
     "GENFRESN": "a Fresnel surface",
-    "GRADIUM": "a gradient-index medium",
+    "GRADIUM": "a gradient-index medium of this kind",
     "GRID_PHA": "a phase given on a grid",
     "GRIDPHAS": "a phase given on a grid",
     "GRIDSAG": "a sag given on a grid",
-    "GRINSU": "a gradient-index medium",
+    "GRINSU": "a gradient-index medium of this kind",
     "HOLOGRM": "a hologram",
     "NONSEQCO": "a non-sequential component",
     "ODDCOSIN": "an odd cosine surface",

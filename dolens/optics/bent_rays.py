@@ -1,0 +1,164 @@
+"""Rays bend in the gap between two surfaces that a gradient fills; see `dolens.optics.gradients`.
+
+A ray is carried to where it meets the next surface, whose place is found first without derivatives.
+From there it goes on along its tangent by what is left, a rounding error, whose derivatives are
+those of the point of intersection.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.optics.elements import (
+    Axes,
+    from_lens_axes,
+    points_from_lens_axes,
+    points_to_lens_axes,
+    to_lens_axes,
+)
+from dolens.optics.gradients import Bend, Gradient, Motion, Number, carry
+from dolens.optics.rays import Components
+
+# Newton's steps towards the next surface, and the share of a path's steps that all but the first
+# take: what is left is short.
+_APPROACHES, _SHARE = 6, 8
+# Of n², beyond which there is no medium.
+_LEAST, _LARGEST = 1e-6, 1e4
+
+
+@dataclass(frozen=True)
+class Space:
+    """The gap behind a surface is filled with a gradient.
+
+    Attributes:
+        medium: the gradient.
+        base: index of its homogeneous medium, with what is added to it.
+        axes: of the surface in front, from which the profile counts.
+        steps: that a ray takes through it.
+        reach: of its profile, mm: a ray that is farther away is lost.
+    """
+
+    medium: Gradient
+    base: Number
+    axes: Axes
+    steps: int
+    reach: float
+
+    def bend(self, x: Number, y: Number, z: Number) -> Bend:
+        """Return n² and its half gradient at points along `axes`, mm."""
+        return self.medium.bend(self.base, x, y, z)
+
+    def index(self, point: tuple[Tensor, Tensor, Tensor], axes: Axes) -> Tensor:
+        """Return the index at points in the axes of a surface, mm."""
+        still = torch.zeros_like(point[0])
+        return self._index(
+            *_seen_from(Components(*point, still, still, still), axes, self.axes)[:3]
+        )
+
+    def cross(
+        self, ray: Components, now: Axes, then: Axes, meet: Callable[[Components], Any]
+    ) -> tuple[Components, Any, Tensor]:
+        """Carry rays through the medium to a surface.
+
+        Args:
+            ray: in the medium, in the axes `now`.
+            now: where the rays are.
+            then: axes of the surface.
+            meet: finds where straight rays meet it, as `dolens.optics.trace.meet` does.
+
+        Returns:
+            The rays that arrive, in the axes `then`; where they meet the surface; and their optical
+            path, mm.
+        """
+        start = _seen_from(ray, now, self.axes)
+        with torch.no_grad():
+            still = Components(*(part.detach() for part in start))
+            t, kept = self._time(self._motion(still), then, meet)
+            t, kept = t.detach(), kept.detach()
+        # A ray that is lost stays at the vertex: nothing infinite comes into the derivatives.
+        x, y, z = (part.masked_fill(~kept, 0.0) for part in start[:3])
+        end = carry(self.bend, self._motion(start._replace(x=x, y=y, z=z)), t, self.steps)
+        found, rest, force = self._meeting(end, then, meet)
+        speeds = zip(end[3:6], (force.x, force.y, force.z), strict=True)
+        cosines = _unit(*(speed + rest * slope for speed, slope in speeds))
+        arriving = _seen_from(Components(*end[:3], *cosines), self.axes, then)
+        size = 1e3 * max(torch.finfo(t.dtype).eps, 1e-9) * (1.0 + self.reach)
+        near = size - rest.detach().abs()
+        met = torch.where(kept, torch.minimum(found.met, near), -1.0)
+        on_it = found.ray._replace(l=arriving.l, m=arriving.m, n=arriving.n)
+        return arriving, found._replace(ray=on_it, met=met), end.path + rest * force.squared
+
+    def between(
+        self, ray: Components, now: Axes, end: tuple[Tensor, Tensor, Tensor], count: int
+    ) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Return points on the way of rays, in the lens's axes, mm, for drawings.
+
+        Args:
+            ray: where they begin, in the axes `now`.
+            now: where the rays are.
+            end: where they meet the next surface, in the lens's axes, mm.
+            count: of points, equal steps of t apart.
+        """
+        start = self._motion(_seen_from(ray, now, self.axes))
+        x, y, z = points_from_lens_axes(end, self.axes)
+        t, motion = torch.zeros_like(x), start
+        for _ in range(_APPROACHES):
+            speeds, ways = motion[3:6], (x - motion.x, y - motion.y, z - motion.z)
+            left = sum(speed * way for speed, way in zip(speeds, ways, strict=True))
+            t = t + left / sum(speed * speed for speed in speeds)
+            motion = carry(self.bend, start, t, self.steps)
+        shares = (k / (count + 1) for k in range(1, count + 1))
+        points = (carry(self.bend, start, share * t, self.steps)[:3] for share in shares)
+        return [points_to_lens_axes(point, self.axes) for point in points]
+
+    def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        x, y, z = (part.clamp(-self.reach, self.reach) for part in (x, y, z))
+        squared = self.bend(x, y, z).squared + torch.zeros_like(x)
+        return squared.clamp(_LEAST, _LARGEST).sqrt()
+
+    def _motion(self, ray: Components) -> Motion:
+        """Return rays in motion."""
+        n = self._index(*ray[:3])
+        return Motion(*ray[:3], n * ray.l, n * ray.m, n * ray.n, torch.zeros_like(n))
+
+    def _meeting(
+        self, motion: Motion, then: Axes, meet: Callable[[Components], Any]
+    ) -> tuple[Any, Tensor, Bend]:
+        """Return where rays meet the surface along their tangents, t to there, and their bend."""
+        x, y, z = motion[:3]
+        tangent = Components(x, y, z, *_unit(*motion[3:6]))
+        found = meet(_seen_from(tangent, self.axes, then))
+        n = self._index(x, y, z)
+        force = self.bend(x, y, z)._replace(squared=n * n)
+        return found, (found.to_plane + found.t) / n, force
+
+    def _time(
+        self, start: Motion, then: Axes, meet: Callable[[Components], Any]
+    ) -> tuple[Tensor, Tensor]:
+        """Return t to the surface, zero for rays that are lost on the way, and which are not."""
+        _, rest, _ = self._meeting(start, then, meet)
+        t, motion, steps = torch.zeros_like(rest), start, self.steps
+        for _ in range(_APPROACHES):
+            t, motion = t + rest, carry(self.bend, motion, rest, steps)
+            steps = max(1, self.steps // _SHARE)
+            _, rest, force = self._meeting(motion, then, meet)
+        t = t + rest
+        kept = (force.squared > _LEAST) & (force.squared < _LARGEST) & t.isfinite()
+        for end in motion[:3]:
+            kept = kept & (end.abs() < self.reach)
+        return t.masked_fill(~kept, 0.0), kept
+
+
+def _unit(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    length = (x * x + y * y + z * z).clamp(min=_LEAST).sqrt()
+    return x / length, y / length, z / length
+
+
+def _seen_from(ray: Components, now: Axes, then: Axes) -> Components:
+    """Return rays in the axes `now` in the axes `then`, where they are."""
+    if now.together(then):
+        return ray._replace(z=ray.z + (now.z - then.z))
+    return from_lens_axes(to_lens_axes(ray, now), then)

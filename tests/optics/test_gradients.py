@@ -1,0 +1,401 @@
+"""Media whose index changes: closed forms, and an integrator of another kind."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad, solve_ivp
+
+import dolens
+from dolens import InputError, Rays
+from dolens.analysis.ray_path import ray_path
+from dolens.optics.gradients import Bend, Gradient, Motion, carry
+from dolens.optics.jacobian import ray_jacobian
+from dolens.optics.materials import index_model, parse_material
+from dolens.optics.paraxial import first_order
+from dolens.optics.paraxial_rays import ParaxialNumbers
+from dolens.optics.ray_tracing import choose_backend
+from dolens.prescriptions.build import lens_from_prescription, prescription_of
+
+N0, A = 1.6, 0.09  # of a rod with n² = n0²(1 - A·r²)
+ROD = f"gradient_squared {N0} r2={-N0 * N0 * A!r}"
+PITCH = 2.0 * math.pi / math.sqrt(A)
+
+
+def lens_of(material, thickness, first=None, second=None, dtype=torch.float64, **more):
+    """One element in air, of planes unless something else is said, and the sensor behind it."""
+    plane = {"type": "plane", "semi_diameter": 3.0}
+    rows = {
+        "1": {**plane, "thickness": thickness, "material": material, **(first or {})},
+        "2": {**plane, "material": "air", **(second or {})},
+    }
+    sensor = {"distance": more.pop("distance", 0.0)}
+    return lens_from_prescription({"surfaces": rows, "sensor": sensor, **more}, dtype)
+
+
+def beam(*points, slopes=None, z=-1.0, dtype=torch.float64):
+    """Rays through points (x, y) in front of the lens, along the axis or with slopes."""
+    xy = torch.tensor(points, dtype=dtype)
+    position = torch.cat([xy, torch.full_like(xy[:, :1], z)], 1)
+    slopes = torch.zeros_like(xy) if slopes is None else torch.tensor(slopes, dtype=dtype)
+    direction = torch.cat([slopes, torch.ones_like(xy[:, :1])], 1)
+    return Rays(position, direction / direction.norm(dim=-1, keepdim=True), 550.0)
+
+
+def close(found, known, tolerance):
+    found = found.detach() if isinstance(found, torch.Tensor) else found
+    np.testing.assert_allclose(found, known, rtol=0.0, atol=tolerance)
+
+
+def test_rays_in_a_parabolic_rod_are_sinusoids_of_their_own_period():
+    # r'' = -ω²r along t, with dz/dt = T_z constant: exact for n² parabolic, skew rays too.
+    length = 0.8 * PITCH
+    lens = lens_of(ROD, length)
+    rays = beam((0.0, 1.5), (0.7, -0.9), (1.2, 0.4), slopes=[(0.0, 0.0), (0.2, 0.1), (-0.1, 0.3)])
+    hit = lens.trace(rays)
+    start = rays.position + rays.direction * (1.0 / rays.direction[:, 2:])
+    n = (N0**2 * (1.0 - A * (start[:, :2] ** 2).sum(-1))).sqrt()
+    across = rays.direction[:, :2]  # n·sin is the same in air and behind the face
+    along = (n**2 - (across**2).sum(-1)).sqrt()
+    omega, t = N0 * math.sqrt(A), length / along
+    swing = omega * t[:, None]
+    known = start[:, :2] * torch.cos(swing) + across * torch.sin(swing) / omega
+    assert bool(hit.valid.all())
+    close(hit.position[:, :2], known, 2e-12)
+    # ∫n²dt = T_z²·t + ∫(dr/dt)²dt.
+    a, b = start[:, :2], across / omega
+    wave, half = torch.sin(2.0 * swing) / (4.0 * omega), 0.5 * t[:, None]
+    moved = omega**2 * (
+        a * a * (half - wave) + b * b * (half + wave) - a * b * torch.sin(swing) ** 2 / omega
+    )
+    air = 1.0 / rays.direction[:, 2]
+    close(hit.path_length, air + along**2 * t + moved.sum(-1), 5e-12)
+
+
+def test_all_rays_through_a_luneburg_lens_meet_on_its_back_after_equal_paths():
+    radius = 5.0
+    medium = f"gradient_squared 1 r2={-1 / radius**2!r} z={2 / radius!r} z2={-1 / radius**2!r}"
+    ball = {"type": "sphere", "semi_diameter": 4.95}
+    lens = lens_of(medium, 2 * radius, {**ball, "radius": radius}, {**ball, "radius": -radius})
+    hit = lens.trace(beam((0.0, 0.0), (0.0, 4.6), (3.1, -2.2), (-1.0, 2.0)))
+    assert bool(hit.valid.all())
+    close(hit.position, [[0.0, 0.0, 10.0]] * 4, 2e-12)
+    close(hit.path_length, [1.0 + radius * (1.0 + math.pi / 2.0)] * 4, 5e-12)
+
+
+def test_rays_in_maxwells_fish_eye_are_circles_that_close():
+    # n = 2/(1 + r²), a stereographic sphere: all rays from r1 meet in -r1/|r1|², half a great
+    # circle of path π away.
+
+    def bend(x, y, z):
+        r2 = x * x + y * y + z * z
+        n = 2.0 / (1.0 + r2)
+        slope = -(n**3)  # ½∇n² = n·∇n = -n·4r/(1 + r²)² = -n³·r
+        return Bend(n * n, slope * x, slope * y, slope * z)
+
+    angles = torch.linspace(-1.2, -0.3, 6, dtype=torch.float64)
+    x0 = 0.5
+    n0 = 2.0 / (1.0 + x0 * x0)
+    one = torch.ones_like(angles)
+    start = Motion(
+        x0 * one, 0 * one, 0 * one, n0 * angles.sin(), 0.6 * n0 * angles.cos(),
+        0.8 * n0 * angles.cos(), 0 * one,
+    )  # fmt: skip
+    t, motion = torch.zeros_like(one), start
+    for _ in range(14):  # Newton, in bounded steps: dP/dt = n²
+        left = (math.pi - motion.path) / bend(*motion[:3]).squared
+        t = t + left.clamp(-0.4, 0.4)
+        motion = carry(bend, start, t, 150)
+    image = torch.tensor([-1.0 / x0, 0.0, 0.0], dtype=torch.float64).expand(6, 3)
+    close(torch.stack(motion[:3], -1), image, 1e-10)
+    close(motion.path, [math.pi] * 6, 1e-12)
+    # On the way the ray is on a circle through both points: its centre is as far from all of them.
+    points = [torch.stack(carry(bend, start, share * t, 150)[:3], -1) for share in (0.2, 0.5, 0.8)]
+    for ray in range(6):
+        p, q, r, s = (v[ray] for v in (torch.tensor([[x0, 0.0, 0.0]] * 6), *points))
+        along, across = q - p, r - p
+        normal = torch.linalg.cross(along, across)
+        centre = p + (
+            torch.linalg.cross(normal, along) * across.dot(across)
+            + torch.linalg.cross(across, normal) * along.dot(along)
+        ) / (2.0 * normal.dot(normal))
+        close((s - centre).norm(), (p - centre).norm(), 1e-9)
+        close((image[ray] - centre).norm(), (p - centre).norm(), 1e-9)
+
+
+def test_an_axial_gradient_keeps_n_sine_and_displaces_as_its_integral_says():
+    terms = {"z": 0.03, "z2": -0.004, "z3": 5e-4, "z4": -2e-5}
+    medium = "gradient 1.5 " + " ".join(f"{k}={v!r}" for k, v in terms.items())
+    slope = 0.5
+    rays = beam((0.0, -1.0), slopes=[(0.0, slope)])
+    hit = lens_of(medium, 4.0).trace(rays)
+    sine = slope / math.hypot(1.0, slope)
+
+    def n(z):
+        return 1.5 + 0.03 * z - 0.004 * z * z + 5e-4 * z**3 - 2e-5 * z**4
+
+    across, _ = quad(
+        lambda z: sine / math.sqrt(n(z) ** 2 - sine**2), 0.0, 4.0, epsabs=1e-14, epsrel=1e-13
+    )
+    path, _ = quad(
+        lambda z: n(z) ** 2 / math.sqrt(n(z) ** 2 - sine**2), 0.0, 4.0, epsabs=1e-14, epsrel=1e-13
+    )
+    close(hit.position[0, 1], -1.0 + slope + across, 1e-12)
+    close(hit.direction[0], rays.direction[0], 1e-13)
+    close(hit.path_length[0], math.hypot(1.0, slope) + path, 1e-11)
+
+
+MEDIUM = "gradient 1.7 r2=-0.012 r4=3e-4 r6=-2e-5 z=0.02 z2=-0.003 x=0.01 y2=-0.004"
+FRONT = {"type": "conic", "radius": 12.0, "conic": -0.4, "semi_diameter": 3.0}
+BACK = {"type": "sphere", "radius": -9.0, "semi_diameter": 3.2}
+
+
+def n_of(p):
+    x, y, z = p
+    r2 = x * x + y * y
+    value = 1.7 - 0.012 * r2 + 3e-4 * r2**2 - 2e-5 * r2**3 + 0.02 * z - 0.003 * z * z
+    radial = -0.024 + 12e-4 * r2 - 12e-5 * r2**2
+    slope = [x * radial + 0.01, y * radial - 0.008 * y, 0.02 - 0.006 * z]
+    return value + 0.01 * x - 0.004 * y * y, np.array(slope)
+
+
+def by_arc_length(position, direction):
+    """A ray through FRONT, MEDIUM and BACK by an integrator of order eight, along its length."""
+
+    def sag(x, y, c, k):
+        r2 = x * x + y * y
+        return c * r2 / (1.0 + math.sqrt(1.0 - (1.0 + k) * c * c * r2))
+
+    def normal(p, c, k):
+        x, y, _ = p
+        e = math.sqrt(1.0 - (1.0 + k) * c * c * (x * x + y * y))
+        v = np.array([-c * x / e, -c * y / e, 1.0])
+        return v / np.linalg.norm(v)
+
+    def snell(d, v, before, after):
+        cosine = d @ v
+        mu = before / after
+        return mu * d + (math.sqrt(1.0 - mu * mu * (1.0 - cosine**2)) - mu * cosine) * v
+
+    c, k = 1.0 / 12.0, -0.4
+    t = -position[2] / direction[2]
+    for _ in range(60):
+        p = position + t * direction
+        t = t - (p[2] - sag(p[0], p[1], c, k)) / (direction @ normal(p, c, k)) * normal(p, c, k)[2]
+    p = position + t * direction
+    d = snell(direction, normal(p, c, k), 1.0, n_of(p)[0])
+
+    def slopes(_, y):
+        n, g = n_of(y[:3])
+        return np.concatenate([y[3:6] / n, g, [n]])
+
+    def back(_, y):
+        return y[2] - 4.0 - sag(y[0], y[1], -1.0 / 9.0, 0.0)
+
+    back.terminal, back.direction = True, 1.0
+    begin = np.concatenate([p, n_of(p)[0] * d, [t]])
+    run = solve_ivp(slopes, (0.0, 20.0), begin, "DOP853", rtol=3e-14, atol=1e-14, events=back)
+    y = run.y_events[0][0]
+    n, _ = n_of(y[:3])
+    return y[:3], snell(y[3:6] / n, normal(y[:3], -1.0 / 9.0, 0.0), n, 1.0), y[6]
+
+
+RAYS = {
+    "points": ((0.5, 1.0), (-1.8, 0.6), (0.2, -2.2)),
+    "slopes": [(0.05, -0.1), (0.15, 0.02), (-0.02, 0.2)],
+}
+
+
+def thick_lens(dtype=torch.float64, **more):
+    return lens_of(MEDIUM, 4.0, FRONT, BACK, dtype, **more)
+
+
+def test_a_thick_lens_of_every_kind_of_term_agrees_with_an_integrator_of_order_eight():
+    rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
+    hit = thick_lens().trace(rays, record=True)
+    assert bool(hit.valid.all())
+    for i in range(3):
+        point, direction, path = by_arc_length(rays.position[i].numpy(), rays.direction[i].numpy())
+        close(hit.points[1, i], point, 3e-12)
+        close(hit.direction[i], direction, 3e-12)
+        tail = (4.0 - point[2]) / direction[2]
+        close(hit.path_length[i], path + tail, 1e-11)
+
+
+def test_single_precision_is_near_to_double():
+    rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
+    hit, single = thick_lens().trace(rays), thick_lens(torch.float32).trace(rays)
+    assert bool(single.valid.all())
+    close(single.position.double(), hit.position.detach(), 3e-6)
+
+
+def test_light_that_goes_back_takes_the_same_way():
+    lens, rays = thick_lens(), beam(*RAYS["points"], slopes=RAYS["slopes"])
+    hit = lens.trace(rays)
+    back = lens.sensor_to_scene(Rays(hit.position, -hit.direction, 550.0))
+    close(back.direction, -rays.direction, 2e-12)
+    at = back.position + back.direction * ((-1.0 - back.position[:, 2:]) / back.direction[:, 2:])
+    close(at, rays.position, 1e-11)
+
+
+def test_a_mirror_behind_a_gradient_sends_light_back_through_the_same_profile():
+    # Unfolded, a rod of half the pitch: an inverted image of the ray, and the same direction.
+    medium = f"{ROD} z=0.0"
+    rows = {
+        "1": {"type": "plane", "semi_diameter": 3.0, "thickness": PITCH / 4, "material": medium},
+        "2": {"type": "plane", "semi_diameter": 3.0, "thickness": -PITCH / 4, "material": "mirror"},
+        "3": {"type": "plane", "semi_diameter": 3.0, "material": "air"},
+    }
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 0.0}})
+    hit = lens.trace(beam((0.0, 0.02), (0.01, -0.01)))
+    close(hit.position[:, :2], [[0.0, -0.02], [-0.01, 0.01]], 1e-9)
+    assert float(lens.first_order(550.0).power) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_an_element_that_is_tilted_carries_its_profile_with_it():
+    # Rays that are turned and moved with the element see what they saw before.
+    pose = {"tilt_x": 5.0, "decenter_y": 0.3}
+    elements = {"one": {"surfaces": [1, 2], **pose}}
+    plain, tilted = thick_lens(distance=10.0), thick_lens(distance=10.0, elements=elements)
+    rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
+    rotation, origin = tilted.system().place(1)
+    turned = Rays(origin + rays.position @ rotation.T, rays.direction @ rotation.T, rays.wavelength)
+    hit, other = plain.trace(rays), tilted.trace(turned)
+    close(other.direction, (hit.direction.detach() @ rotation.T), 1e-12)
+
+
+@pytest.mark.parametrize(
+    "name", ["surfaces.1.curvature", "surfaces.2.curvature", "thicknesses.1", "elements.one.tilt_x"]
+)
+def test_derivatives_are_those_of_differences(name):
+    elements = {"one": {"surfaces": [1, 2], "tilt_x": 2.0, "decenter_y": 0.1}}
+    lens = thick_lens(distance=6.0, elements=elements)
+    rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
+
+    def outputs(value):
+        hit = lens.with_values({name: value}).trace(rays)
+        return torch.cat([hit.position[:, :2].reshape(-1), hit.path_length])
+
+    value = dict(lens.named_parameters())[name].detach().clone()
+    found = torch.autograd.functional.jacobian(outputs, value)
+    step = 1e-5
+    known = (outputs(value + step) - outputs(value - step)) / (2.0 * step)
+    close(found, known.detach(), 2e-8)
+    forward = ray_jacobian(lens, rays, [name], ("x", "y", "path_length"))
+    mixed = torch.cat([forward.derivatives[:, :2, 0].reshape(-1), forward.derivatives[:, 2, 0]])
+    close(mixed, found, 1e-11)
+
+
+def test_derivatives_with_respect_to_rays_and_wavelengths():
+    lens = lens_of(MEDIUM.replace("1.7", "N-SF6"), 4.0, FRONT, BACK)
+    start = beam((0.5, 1.0), slopes=[(0.05, -0.1)])
+
+    def place(numbers):
+        y, wavelength = numbers.unbind()
+        position = start.position + torch.stack([0 * y, y, 0 * y])
+        hit = lens.trace(Rays(position, start.direction, wavelength))
+        return torch.cat([hit.position[0, :2], hit.path_length])
+
+    at = torch.tensor([0.1, 600.0], dtype=torch.float64)
+    found = torch.autograd.functional.jacobian(place, at)
+    steps = torch.diag(torch.tensor([1e-5, 1e-2], dtype=torch.float64))
+    known = [(place(at + s) - place(at - s)) / (2.0 * s.sum()) for s in steps]
+    close(found, torch.stack(known, -1).detach(), 1e-8)
+
+
+def test_rays_that_are_lost_are_finite_and_spoil_no_gradient():
+    # At a height of 2.9 mm the index would be negative.
+    lens = lens_of("gradient 1.6 r2=-0.05 r4=-0.02", 6.0, FRONT, BACK)
+    hit = lens.trace(beam((0.0, 0.1), (0.0, 2.9), (500.0, 0.0), (0.0, 1e9)))
+    assert hit.valid.tolist() == [True, False, False, False]
+    assert bool(hit.position.isfinite().all() and hit.path_length.isfinite().all())
+    hit.position.sum().backward()
+    for name, parameter in lens.named_parameters():
+        assert parameter.grad is None or bool(parameter.grad.isfinite().all()), name
+
+
+def test_first_order_optics_of_a_parabolic_rod():
+    length = 0.15 * PITCH
+    lens = lens_of(ROD, length)
+    first, g = lens.first_order(550.0), math.sqrt(A)
+    assert float(first.efl) == pytest.approx(1.0 / (N0 * g * math.sin(g * length)), rel=1e-13)
+    assert float(first.bfd) == pytest.approx(1.0 / (N0 * g * math.tan(g * length)), rel=1e-13)
+    diverging = lens_of(ROD.replace("r2=-", "r2="), length).first_order(550.0)
+    assert float(diverging.efl) == pytest.approx(-1.0 / (N0 * g * math.sinh(g * length)), rel=1e-13)
+    numbers = ParaxialNumbers.of(lens.system())
+    assert numbers.exit_pupil(550.0)[0] == pytest.approx(float(first.exit_pupil.z), rel=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["gradient", "gradient_squared"])
+def test_first_order_optics_is_the_limit_of_real_rays(kind):
+    medium = f"{kind} 1.7 r2=-0.012 r4=3e-4 z=0.02 z2=-0.003 x2=0.004 y2=-0.004"
+    lens = lens_of(medium, 4.0, FRONT, BACK)
+    height = 1e-4
+    hit = lens.trace(beam((0.0, height), (height, 0.0)))
+    for axis, meridian in ((1, "y"), (0, "x")):
+        ray = hit.direction[1 - axis].detach()
+        power = -float(ray[axis] / ray[2]) / height
+        section = first_order(lens.system().section(meridian), 550.0)
+        assert float(section.power) == pytest.approx(power, rel=1e-8)
+
+
+def test_first_order_optics_has_the_derivative_of_its_number():
+    lens = lens_of("gradient 1.7 r2=-0.012 z=0.02", 4.0, FRONT, BACK)
+    value = lens.thicknesses["1"].detach().clone()
+
+    def power(thickness):
+        return lens.with_values({"thicknesses.1": thickness}).first_order(550.0).power
+
+    found = torch.autograd.functional.jacobian(power, value)
+    known = (power(value + 1e-4) - power(value - 1e-4)) / 2e-4
+    assert float(found) == pytest.approx(float(known.detach()), rel=1e-7)
+
+
+def test_a_medium_is_written_and_read_again():
+    lens = lens_of("gradient SCHOTT:N-BK7 r2=-1e-3 z=.5e-2", 4.0)
+    row = prescription_of(lens)["surfaces"]["1"]
+    assert row["material"] == "gradient SCHOTT:N-BK7 r2=-0.001 z=0.005"
+    medium = parse_material(row["material"], index_model("dfc"))
+    assert medium == lens.materials[1] and isinstance(medium, Gradient)
+    assert medium.index(550.0) == parse_material("N-BK7", index_model("dfc")).index(550.0)
+    assert bool(lens.first_order(400.0).efl != lens.first_order(700.0).efl)
+
+
+@pytest.mark.parametrize(
+    ("material", "message"),
+    [
+        ("gradient 1.6", "write a medium and terms"),
+        ("gradient r2=1", "write a medium and terms"),
+        ("gradient 1.6 r3=1", "there is no term 'r3'.*allowed: r2, r4"),
+        ("gradient 1.6 r2=1 r2=2", "'r2' is there twice"),
+        ("gradient 1.6 r2=inf", "r2 must be a number, not 'inf'"),
+        ("gradient mirror r2=1", "'mirror' is no medium with one index"),
+        ("gradient N-BK8 r2=1", "unknown material 'N-BK8'"),
+    ],
+)
+def test_a_medium_that_cannot_be_meant_is_refused(material, message):
+    with pytest.raises(InputError, match=message) as caught:
+        lens_of(material, 4.0)
+    assert "surface 1" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_does_not_hold_in_a_gradient_is_refused_by_name(tmp_path):
+    lens = thick_lens(distance=10.0)
+    views = {
+        "Seidel sums": lambda: lens.seidel(5.0),
+        "ghosts": lambda: lens.ghosts(),
+        "polarised rays": lambda: lens.trace_polarised(beam((0.0, 0.1))),
+        "the path of one ray": lambda: ray_path(lens, beam((0.0, 0.1))),
+        "another temperature": lambda: lens.at(40.0),
+    }
+    for what, view in views.items():
+        with pytest.raises(InputError, match=f"{what}.*behind surface 1 has a gradient"):
+            view()
+    with pytest.raises(InputError, match="backend 'cpu': the medium behind surface 1"):
+        choose_backend(lens.system().traced_by("cpu"))
+    with pytest.raises(InputError, match="behind the last surface cannot be a gradient"):
+        lens_of("1.5", 4.0, second={"material": MEDIUM})
+    for suffix in (".zmx", ".seq", ".txt"):
+        with pytest.raises(InputError, match="gradient"):
+            dolens.save_lens(lens, tmp_path / f"lens{suffix}")

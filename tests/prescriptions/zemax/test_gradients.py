@@ -1,0 +1,91 @@
+"""Gradient-index media of Zemax's surfaces are those of a prescription."""
+
+import math
+
+import pytest
+
+from dolens import InputError, load_lens
+from dolens.prescriptions.files import check_file
+from dolens.prescriptions.zemax.reader import read_zemax
+from tests.prescriptions.zemax.samples import GLASS, singlet
+
+
+def text(kind, *parameters, more=(), head="FLOA\n", radius="0.02"):
+    lines = [f"PARM {n} {word}" for n, word in enumerate(parameters, 1)]
+    return singlet(f"TYPE {kind}", f"CURV {radius}", "DISZ 4", "DIAM 5", *lines, *more, head=head)
+
+
+def medium(*given, **more):
+    return read_zemax(text(*given, **more), "a.zmx").prescription["surfaces"]["1"]["material"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "material"),
+    [
+        ("GRINSUR1", "0.5 1.6 -0.002", "gradient 1.6 r2=-0.002"),
+        (
+            "GRINSUR2",
+            "0.5 2.25 -0.02 1e-3 0 0 0 2e-9",
+            "gradient_squared 1.5 r2=-0.02 r4=0.001 r12=2e-09",
+        ),
+        (
+            "GRINSUR3",
+            "0.5 1.6 -0.002 1e-4 2e-6 0.03 -4e-3 5e-5",
+            "gradient 1.6 r2=-0.002 r4=0.0001 r6=2e-06 z=0.03 z2=-0.004 z3=5e-05",
+        ),
+        (
+            "GRINSUR4",
+            "0.5 1.6 0.1 0.2 0.3 0.4 0.5 0.6",
+            "gradient 1.6 x=0.1 x2=0.2 y=0.3 y2=0.4 z=0.5 z2=0.6",
+        ),
+        (
+            "GRINSUR5",
+            "0.5 1.6 -0.002 1e-4 0.03 -4e-3 5e-5 -6e-6 0 0",
+            "gradient 1.6 r2=-0.002 r4=0.0001 z=0.03 z2=-0.004 z3=5e-05 z4=-6e-06",
+        ),
+        ("GRINSUR3", "0.5 1.6", "1.6"),
+    ],
+)
+def test_parameters_are_terms(kind, parameters, material):
+    assert medium(kind, *parameters.split()) == material
+
+
+def test_coefficients_are_in_the_unit_of_the_file():
+    inch = 25.4
+    found = medium("GRINSUR3", "0.5", "1.6", "0.5", "0", "0", "0.25", head="FLOA\nUNIT IN\n")
+    kind, base, *terms = found.split()
+    values = {name: float(value) for name, _, value in (term.partition("=") for term in terms)}
+    assert (kind, base) == ("gradient", "1.6")
+    assert values == pytest.approx({"r2": 0.5 / inch**2, "z": 0.25 / inch}, rel=1e-15)
+
+
+def test_a_rod_of_a_quarter_of_its_pitch_brings_parallel_light_to_its_end(tmp_path):
+    # n = n0(1 - A·r²/2): paraxial rays are sinusoids of the pitch 2π/√A.
+    n, root = 1.6075, 0.304
+    rod = text("GRINSUR1", "0", str(n), str(-0.5 * n * root**2), radius="0")
+    rod = rod.replace("DISZ 4", f"DISZ {math.pi / (2.0 * root)!r}").replace("CURV -0.02", "CURV 0")
+    (tmp_path / "rod.zmx").write_text(rod)
+    assert not check_file(tmp_path / "rod.zmx").reason
+    first = load_lens(tmp_path / "rod.zmx").first_order(550.0)
+    assert float(first.efl) == pytest.approx(1.0 / (n * root), rel=1e-12)
+    assert float(first.bfd) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("GRINSUR3",), "PARM 2, the index at the vertex, must be positive, not 0"),
+        (("GRINSUR1", "1", "1.6", "0", "3"), "PARM 4 is 3, but TYPE GRINSUR1 has PARM 1 to 3"),
+        (("GRINSUR5", "1", "1.6", *("0",) * 6, "0.1"), "a tilted surface in front of a gradient"),
+        (("GRINSUR9", "1", "1.6"), "a gradient-index medium of this kind is not held"),
+        (("GRADIUM", "1"), "a gradient-index medium of this kind is not held"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        medium(*given)
+
+
+def test_a_gradient_with_a_dispersion_of_its_own_is_refused():
+    with pytest.raises(InputError, match=r"dispersion of its own is not held \(GLAS ___BLANK"):
+        medium("GRINSUR5", "1", "1.6", more=(GLASS,))
