@@ -58,6 +58,7 @@ _VIEWS = (
         "lateral_colour",
         "mtf",
         "photograph",
+        "photograph_polarised",
         "polarisation",
         "psf",
     ),

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
+from hydra.utils import instantiate
 from PIL import Image
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -48,6 +49,7 @@ SIZES = {
     "draw(100_000,": "draw(1_000,",
     "workers_of(2)": "workers_of(0)",
     "seconds=10)": "seconds=1)",
+    'load_lens("double_gauss").coated("quarter_wave")\nl': 'load_lens("cooke_triplet")\nl',
 }
 OTHERS = (
     ".venv/bin/pip",
@@ -256,10 +258,13 @@ for block in BLOCKS:
 
 @pytest.mark.parametrize("page", PYTHON)
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
-    """One block after another, in a folder with the lens and the picture that pages speak of."""
+    """One block after another, in a folder with the lens and the pictures that pages speak of."""
     monkeypatch.chdir(tmp_path)
     save_lens(load_lens("double_gauss"), tmp_path / "lens.yaml")
     Image.effect_noise((60, 40), 50).convert("RGB").save(tmp_path / "picture.jpg")
+    night = np.full((40, 60, 4), [90, 100, 120, 126], np.uint8)
+    night[10, 45] = [250, 200, 150, 144]
+    (tmp_path / "street.hdr").write_bytes(b"#?RADIANCE\n\n-Y 40 +X 60\n" + night.tobytes())
     names = {"__name__": "__main__"}
     for text in PYTHON[page]:
         for size, smaller in SIZES.items():
@@ -292,10 +297,16 @@ def a_design(keys, name="cooke_triplet"):
     assert math.isfinite(merit().sum_of_squares())
 
 
+def lights(keys):
+    """Lights in the pictures of a camera."""
+    return instantiate(keys["views"]["lights"])
+
+
 # The first line of a fragment of YAML, and what takes it.
 FRAGMENTS = {
     "docs/coatings.md: coating: quarter_wave": a_lens,
     "docs/conventions.md: '3': {type: coordinate_break": a_lens,
+    "docs/ghosts.md: views:": lights,
     "docs/ghosts.md: variables:": partial(a_design, name="double_gauss"),
     "docs/glass.md: temperature: 60": a_lens,
     "docs/glass.md: surfaces:": a_lens,

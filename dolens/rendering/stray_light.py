@@ -38,8 +38,8 @@ _LARGEST_CELL = 64
 # Cells of a grid around the sensor, for splines.
 _MARGIN = 2
 _BOUNCES = (2, 4, 6)
-# Fields whose ghosts make the veil, over areas that are alike, and their rays.
-_VEIL_FIELDS, _VEIL_RAYS = 4, 1000
+# Fields whose ghosts make the veil, over areas that are alike.
+_VEIL_FIELDS = 4
 
 
 class Light(NamedTuple):
@@ -101,7 +101,7 @@ def light_on_sensor(
         found = torch.zeros(shape, dtype=torch.float64, device=lens.device)
         grids: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = defaultdict(list)
         for light in lights:
-            x, y = _object_point(light, sensor, scale)
+            x, y = object_point(light.row, light.column, sensor, scale)
             cosine = depth / math.hypot(x, y, depth)
             factor = light.power[channel] * cosine**3 / (scale * depth) ** 2 / white
             if factor == 0.0:
@@ -194,12 +194,19 @@ def _axial_aperture(imaging: ImagingSystem) -> float:
     return square / (square + length * length)
 
 
-def _object_point(light: Light, sensor: Sensor, scale: float) -> tuple[float, float]:
-    """Return x and y (mm) of a light on the object plane, which a pinhole images upright."""
+def object_point(row: float, column: float, sensor: Sensor, scale: float) -> tuple[float, float]:
+    """Return x and y (mm) of the point of the object plane that a pinhole images upright there.
+
+    Args:
+        row: pixels.
+        column: pixels.
+        sensor: the pixels.
+        scale: magnification of the plane.
+    """
     pitch = sensor.pixel_pitch / scale
-    column = light.column - (0.5 * (sensor.width - 1) - sensor.centre_column)
-    row = light.row - (0.5 * (sensor.height - 1) - sensor.centre_row)
-    return column * pitch, -row * pitch
+    right = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+    down = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+    return right * pitch, -down * pitch
 
 
 @torch.no_grad()
@@ -233,16 +240,16 @@ def _on_pixels(
     return bilinear(grid[None], *torch.meshgrid(*places, indexing="ij"))[0]
 
 
-@torch.no_grad()
 def veil(
     lens: Lens,
     imaging: ImagingSystem,
     plane: int,
     sensor_reflectance: float = 0.0,
     bounces: int = 2,
+    rays: int = 1000,
 ) -> Tensor:
     """Return the power of ghosts on the sensor over that of the image, (C,): the mean over the
-    picture's area.
+    picture's area.  Differentiable as `light_on_sensor`, but for what crosses the sensor's edge.
 
     Args:
         lens: of the imaging system.
@@ -250,6 +257,7 @@ def veil(
         plane: number of the plane, from 0.
         sensor_reflectance: share of the light that the sensor reflects.
         bounces: most reflections of a ghost's path, 2, 4 or 6.
+        rays: of each field, path and wavelength.
     """
     lens, sensor, scene = in_double_precision(lens), imaging.sensor, imaging.scene
     depth, scale = scene.depths[plane], scene.magnifications(lens.system())[plane]
@@ -257,20 +265,20 @@ def veil(
     paths = _paths(lens, bounces, sensor_reflectance)
     found = []
     for wavelength in scene.wavelengths:
-        ghosts = image = 0.0
+        ghosts = image = torch.zeros((), dtype=torch.float64, device=lens.device)
         for number in range(_VEIL_FIELDS):
             height = corner * math.sqrt((number + 0.5) / _VEIL_FIELDS) / scale
             where = conditions(lens, [(0.0, height)], [wavelength], depth)
-            for part in ghost_light(lens, where, paths, _VEIL_RAYS, sensor_reflectance):
+            for part in ghost_light(lens, where, paths, rays, sensor_reflectance):
                 if part.path == ENTERING:
                     continue
-                caught = float((part.light * _caught(part.points, sensor)).sum())
+                caught = (part.light * _caught(part.points.detach(), sensor)).sum()
                 if part.path == IMAGE:
-                    image += caught
+                    image = image + caught
                 else:
-                    ghosts += caught
-        found.append(ghosts / image if image > 0.0 else 0.0)
-    return torch.tensor(found, dtype=torch.float64, device=lens.device)
+                    ghosts = ghosts + caught
+        found.append(ghosts / image.clamp(min=torch.finfo(image.dtype).tiny))
+    return torch.stack(found)
 
 
 def _caught(points: Tensor, sensor: Sensor) -> Tensor:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from dolens.optics.lens import Lens
     from dolens.rendering.photograph import Photograph
+    from dolens.rendering.stokes_images import StokesPhotograph
 
 _FROM_PICTURE = "from picture"
 
@@ -142,3 +143,52 @@ class PhotographViews:
             stray = StrayLight(lens, tuple(found), share, diffraction != "none", bounces)
             camera = replace(camera, stray_light=stray)
         return next(camera.photographs(linear, seed))
+
+    def photograph_polarised(
+        self,
+        scene: Tensor,
+        distance: float | None = None,
+        light: float | None = 1000.0,
+        *,
+        read_noise: float = 3.0,
+        sensor: tuple[float, float] | None = None,
+        pixel_pitch: float | None = None,
+        seed: int = 0,
+    ) -> StokesPhotograph:
+        """Return what a sensor with polarisers at 0, 45, 90 and 135 degrees sees of a polarised
+        scene behind the lens, which changes polarisation where its surfaces have coatings or are
+        bare; see `dolens.rendering.stokes_images`.
+
+        Args:
+            scene: (4, 3, h, w) or (4, h, w), Stokes vectors in linear light; S₀ is 1 for white.
+            distance: see `photograph`, as the other arguments that are not named here.
+            light: electrons of a white, unpolarised pixel without a polariser; None: no noise.
+            read_noise: see `photograph`.
+            sensor: see `photograph`.
+            pixel_pitch: see `photograph`.
+            seed: see `photograph`.
+
+        Returns:
+            A `StokesPhotograph`: Stokes vectors before and behind the lens, what the sensor gives
+            and what it makes of it; `figure()` shows them.
+
+        Raises:
+            InputError: as `photograph`; more polarised than fully, or a coating that is a table of
+                shares.
+        """
+        from dolens.rendering.lens_camera import required_number, sensor_behind
+        from dolens.rendering.photograph import LensCamera, readout_in
+        from dolens.rendering.stokes_images import check_stokes, stokes_photograph
+
+        lens = as_lens(self)
+        scene = scene[:, None].expand(-1, 3, -1, -1) if scene.ndim == 3 else scene
+        check_stokes(scene)
+        distances = (
+            []
+            if distance is None
+            else [required_number("distance", distance, math.inf, "mm, or infinity")]
+        )
+        height, width = scene.shape[-2:]
+        pixels = sensor_behind(lens, (height, width), sensor, pixel_pitch)
+        camera = LensCamera.of(lens, pixels, readout_in(light, read_noise), distances)
+        return stokes_photograph(lens, camera, scene, seed)

@@ -20,9 +20,9 @@ from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
 # Streams of random numbers that must not meet: an offset of the seed for each stage, and others for
-# the sensor's noise and for what is drawn into scenes.
+# the sensor's noise, for what is drawn into scenes, and for lights.
 _STAGES = {"train": 0, "val": 1, "test": 2}
-_STRIDE, _NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
+_STRIDE, _NOISE_OFFSET, SCENE_OFFSET, LIGHTS_OFFSET = 1 << 40, 1 << 39, 1 << 38, 1 << 37
 
 
 class Shot(NamedTuple):

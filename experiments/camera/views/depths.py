@@ -11,12 +11,14 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.pixel_psf import with_diffraction_limit
 from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.views.base import (
+    LIGHTS_OFFSET,
     SCENE_OFFSET,
     Comparison,
     Imaging,
     Shot,
     Views,
 )
+from dolens.experiments.camera.views.lights import RandomLights
 from dolens.experiments.camera.views.truth import (
     TRUTHS,
     reference_chief_ray_map,
@@ -66,6 +68,7 @@ class DepthViews(Imaging):
             perfect pupil's diffraction, as a measurement would find them.
         psf_depths: of the functions that networks ask for, mm; None: the scene's.  A camera that is
             calibrated at its own depths is judged at others by it.
+        lights: are added to all images, those of tests too; None: none.
 
     Raises:
         InputError: the renderers' sensors differ, an unknown word, or no depths.
@@ -84,8 +87,10 @@ class DepthViews(Imaging):
         reference_renderers: Mapping[str, Renderer] | None = None,
         psf_diffraction: str = "none",
         psf_depths: Sequence[float] | None = None,
+        lights: RandomLights | None = None,
     ) -> None:
         super().__init__(scene, renderer, readout, seed)
+        self.lights = lights
         if psf_depths is not None and not len(psf_depths):
             raise InputError("views.psf_depths: []; allowed: null, or depths in mm")
         self.psf_depths = None if psf_depths is None else tuple(map(float, psf_depths))
@@ -125,6 +130,8 @@ class DepthViews(Imaging):
     def expose(self, lens: Lens) -> None:
         """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
         super().expose(lens)
+        if self.lights is not None:
+            self.lights.begin(lens, self.scene, self.sensor)
         if self.psf_diffraction != "none":
             self._f_number = axial_f_number(lens)
 
@@ -163,8 +170,11 @@ class DepthViews(Imaging):
             renderer = self._reference_renderers[shot.reference]
         seed = shot.seed(self.seed)
         image = renderer.render(lens, self.scene, shot.textures, seed)
-        raw = self._raw(image, seed, shot.share)
-        return Views(self._truth(lens, shot.textures).expand_as(raw), raw)
+        truth = self._truth(lens, shot.textures).expand_as(image)
+        if self.lights is not None:
+            given = (image, truth, seed + LIGHTS_OFFSET, shot.share)
+            image, truth = self.lights.added_to(lens, *given)
+        return Views(truth, self._raw(image, seed, shot.share))
 
     def _truth(self, lens: Lens, textures: Tensor) -> Tensor:
         """(B, D or 1, 3, H, W), display-encoded."""
