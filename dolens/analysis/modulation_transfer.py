@@ -180,10 +180,15 @@ def frequency_range(
 
     Rarely needed:
         aimed: as `modulation` takes it.
+
+    Raises:
+        InputError: the lens is afocal.
     """
     lens = in_double_precision(lens)
     spots = spot_diagram(lens, where.that_count(), 400, aimed)
     cutoff = float((AIRY / spots.airy_radius).min())
+    if cutoff == 0.0:
+        raise InputError(f"lens '{lens.name}' is afocal: its MTF has no range of frequencies")
     radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
     end = min(cutoff, 0.68 / max(radius, 1e-9))
     power = 10.0 ** math.floor(math.log10(end))

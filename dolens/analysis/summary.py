@@ -52,8 +52,8 @@ class LensSummary(FirstOrderNumbers):
         field_unit: `°` or `mm`.
         fields: of the lens.
         seidel_field: degrees or mm, the edge of the field that the sums are of.
-        seidel: sums of the lens, mm of wave aberration, by name; none where a medium is a gradient,
-            of which no sums hold.
+        seidel: sums of the lens, mm of wave aberration, by name; none where a medium is a crystal
+            or a gradient, of which no sums hold.
         seidel_by_surface: the same of every surface.
     """
 
@@ -146,7 +146,8 @@ def lens_summary(lens: Lens, given: Conditions) -> LensSummary:
     """Summarise a lens at given conditions."""
     exact = in_double_precision(lens)
     spots = spot_diagram(exact, given, _RAYS)
-    sums = None if exact.system().gradients else seidel_sums(exact, given)
+    system = exact.system()
+    sums = None if system.gradients or system.anisotropic else seidel_sums(exact, given)
     by_surface = {} if sums is None else sums.by_surface._asdict()
     geo = spots.geo[:, spots.where.weights > 0.0].nan_to_num(-math.inf).amax(-1)
     first = first_order_numbers(exact, given)

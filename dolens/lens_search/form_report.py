@@ -23,7 +23,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_rays import ParaxialNumbers
-from dolens.optics.system import require_homogeneous
+from dolens.optics.system import require_one_index
 from dolens.plotting.small_sections import SmallSection, form_section
 from dolens.plotting.tolerances import parameter_label
 from dolens.prescriptions.build import prescription_of
@@ -64,10 +64,10 @@ def element_powers(lens: Lens) -> tuple[ElementPower, ...]:
     """Return the powers of the elements of a centred lens, from the front.
 
     Raises:
-        InputError: a medium is a gradient.
+        InputError: a medium is a crystal or a gradient.
     """
     system = lens.system().double()
-    require_homogeneous(system, "powers of elements")
+    require_one_index(system, "powers of elements")
     wave = lens.primary_wavelength
     numbers = ParaxialNumbers.of(system)
     efl = float(lens.first_order(wave).efl)

@@ -28,7 +28,7 @@ from dolens.lens_search.short_search import LensSearch, check_amounts, collected
 from dolens.lens_search.specification import Limits, Specification
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
-from dolens.optics.system import require_homogeneous
+from dolens.optics.system import require_one_index
 from dolens.optimize.merit import evaluate_operands
 from dolens.optimize.operands import Operand
 from dolens.tasks import TaskMap
@@ -255,7 +255,7 @@ def _check_kinds(lens: Lens, object_distance: float | None) -> None:
         or any(p.item() != 0.0 for e in lens.elements.values() for p in e.parameters())
     ):
         raise InputError(f"{name} has mirrors or tilted elements; allowed: refraction in line")
-    require_homogeneous(lens.system(), f"{name}: a search")
+    require_one_index(lens.system(), f"{name}: a search")
     if lens.index_model != "dfc" or not any(map(is_glass, lens.materials)):
         raise InputError(f"{name}: allowed: elements of glass with index_model dfc")
     if is_glass(lens.materials[0]) or is_glass(lens.materials[-1]):

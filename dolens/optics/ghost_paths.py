@@ -25,7 +25,7 @@ from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.coordinate_break import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.plane import Plane
 from dolens.optics.surfaces.state import SurfaceState
-from dolens.optics.system import OpticalSystem, require_homogeneous, require_isotropic
+from dolens.optics.system import OpticalSystem, require_one_index
 
 Path = tuple[int, ...]
 # Paths of many reflections are too many to count.
@@ -43,9 +43,9 @@ def reflecting_surfaces(system: OpticalSystem, sensor: bool = False) -> tuple[in
         sensor: whether the sensor reflects too; its number is one more than the last surface's.
 
     Raises:
-        InputError: a medium is a gradient.
+        InputError: a medium is a crystal or a gradient.
     """
-    require_homogeneous(system, "ghosts")
+    require_one_index(system, "ghosts")
     count = len(system.surfaces)
     found = [n for n in range(1, count + 1) if _reflects(system, n)]
     return (*found, count + 1) if sensor else tuple(found)
@@ -196,7 +196,6 @@ def ghost_path_systems(
         paths: as `ghost_paths` gives them.
         sensor: what a sensor that reflects catches of the light.
     """
-    require_isotropic(system, "ghosts")
     onto_sensor = system.image
     if onto_sensor is None:
         onto_sensor = SurfaceState(Plane, {}, sensor)
@@ -271,7 +270,6 @@ def with_losses(system: OpticalSystem) -> OpticalSystem:
     """Return the lens with bare glass where a surface has no coating: an ideal one, which passes
     all light, makes no ghosts.
     """
-    require_isotropic(system, "ghosts")
     surfaces = [
         replace(surface, coating=Stack())
         if surface.coating is None and _reflects(system, number)

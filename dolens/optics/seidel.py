@@ -44,7 +44,7 @@ from dolens.errors import InputError
 from dolens.optics.paraxial import deflects, powers_of
 from dolens.optics.paraxial_rays import ParaxialRay, paraxial_rays
 from dolens.optics.surfaces.ideal_lens import IdealLens
-from dolens.optics.system import OpticalSystem, require_homogeneous, require_isotropic
+from dolens.optics.system import OpticalSystem, require_one_index
 
 
 class Seidel(NamedTuple):
@@ -92,10 +92,9 @@ def seidel(
         color: the shorter and the longer wavelength in nm: δn = n(shorter) - n(longer).
 
     Raises:
-        InputError: a medium is a gradient, or a law that Seidel sums do not describe.
+        InputError: a medium is a crystal or a gradient, or a law that Seidel sums do not describe.
     """
-    require_isotropic(system, "Seidel sums")
-    require_homogeneous(system, "Seidel sums")
+    require_one_index(system, "Seidel sums")
     marginal, chief, invariant = paraxial_rays(system, wavelength, field, object_distance)
     index = _vector(system.signed_indices(wavelength), system)
     short, long = (_vector(system.signed_indices(nm), system) for nm in color)

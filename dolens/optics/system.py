@@ -475,7 +475,7 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
     """Return whether a system holds nothing that a call leaves behind: values that
     `functional_call` puts in the place of parameters, or numbers computed from parameters.
     """
-    stored = {id(part) for part in parts if isinstance(part, Tensor) and _isplain(part)}
+    stored = {id(part) for part in parts if isinstance(part, Tensor) and _is_plain(part)}
     tensors = [*system.thicknesses, system.sensor_distance]
     for surface in (*system.surfaces, system.image):
         if surface is not None:
@@ -491,7 +491,7 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
     return all(id(tensor) in stored for tensor in tensors)
 
 
-def _isplain(tensor: Tensor) -> bool:
+def _is_plain(tensor: Tensor) -> bool:
     """Return whether a tensor is a parameter, or a buffer without a graph."""
     if isinstance(tensor, nn.Parameter):
         return True
@@ -514,14 +514,16 @@ def require_refracting(system: OpticalSystem, what: str) -> None:
             )
 
 
-def require_isotropic(system: OpticalSystem, what: str) -> None:
-    """Raise `InputError` where extraordinary rays go through a lens; arguments as above."""
-    if system.anisotropic:
-        number = system.anisotropic[0]
+def require_one_index(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where the index of a medium depends on direction or place; arguments as
+    above.
+    """
+    for number in system.anisotropic:
         raise InputError(
             f"{what}: the medium behind surface {number} is a crystal of extraordinary rays "
             f"({system.materials[number].name}); only media with one index are held there"
         )
+    require_homogeneous(system, what)
 
 
 def require_homogeneous(system: OpticalSystem, what: str) -> None:

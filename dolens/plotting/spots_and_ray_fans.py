@@ -161,7 +161,9 @@ class _Drawn:
         centre = spots.polychromatic_centroid
         self.points = (1e3 * (spots.intercepts - centre[:, None, None])).numpy()
         self.middles = (1e3 * (spots.centroid - centre[:, None])).numpy()
-        self.airy = 1e3 * spots.airy_radius.numpy()
+        airy = 1e3 * spots.airy_radius.numpy()
+        # That of an afocal lens has no size.
+        self.airy = np.where(np.isfinite(airy), airy, 0.0)
         self.nearest = int((spots.wavelengths - spots.reference_wavelength).abs().argmin())
         rings = np.abs(self.middles).max(-1) + self.airy
         light = max(_largest(self.points), _largest(rings))
@@ -213,7 +215,7 @@ class _Drawn:
 
     @staticmethod
     def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> None:
-        if np.isfinite(middle).all():
+        if radius > 0.0 and np.isfinite(middle).all():
             look: dict[str, Any] = {
                 "fill": False,
                 "edgecolor": "black",

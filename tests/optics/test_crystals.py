@@ -488,3 +488,10 @@ def test_refraction_at_grazing_incidence_is_that_of_snell():
 def test_only_an_axis_along_z_leaves_a_lens_symmetric(axis, symmetric):
     """An image between two fields is found by turning one's only where nothing singles out y."""
     assert plate(f"{CALCITE} extraordinary {axis}").system().rotationally_symmetric == symmetric
+
+
+def test_a_lens_with_a_crystal_has_a_summary_without_seidel_sums():
+    lens = lens_of((f"{CALCITE} extraordinary 0 1 1", 10.0, {"radius": 40.0}), ("air", None))
+    text = repr(lens.summary(wavelengths=589.3))
+    assert "effective focal length" in text.lower() or "efl" in text.lower()
+    assert "spherical" not in text

@@ -17,6 +17,7 @@ from dolens.analysis.spot_diagram import (
     rms_against_wavelength,
     spot_diagram,
 )
+from dolens.errors import InputError
 from dolens.plotting import (
     modulation_figure,
     ray_fans_figure,
@@ -25,6 +26,7 @@ from dolens.plotting import (
     spots_figure,
 )
 from dolens.plotting.style import spectral_colour
+from dolens.prescriptions import lens_from_prescription
 from tests.plotting.artists import by_gid
 from tests.plotting.overlaps import flaws
 
@@ -183,3 +185,24 @@ def test_fans_curves_and_contrast(triplet):
     (box,) = figure.legends
     assert len(box.get_texts()) == 9
     assert len({handle.get_color() for handle in box.legend_handles[:6]}) == 6
+
+
+def test_an_afocal_lens_has_spots_without_an_airy_disc():
+    window = lens_from_prescription(
+        {
+            "name": "window",
+            "stop": 1,
+            "wavelengths": [587.56],
+            "fields": {"angles": [[0, 0]]},
+            "surfaces": {
+                1: {"type": "plane", "semi_diameter": 5, "thickness": 6, "material": "1.5"},
+                2: {"type": "plane", "semi_diameter": 7, "material": "air"},
+            },
+            "sensor": {"distance": 25, "diameter": 20},
+        }
+    )
+    (axes,) = window.spots().axes
+    assert not [artist for artist in axes.get_children() if artist.get_gid() == "airy"]
+    assert axes.get_xlim()[1] == pytest.approx(5000.0, rel=0.1)  # the beam's own half width, µm
+    with pytest.raises(InputError, match="is afocal"):
+        window.mtf()
