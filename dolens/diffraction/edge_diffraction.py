@@ -20,6 +20,7 @@ them are exact where pixels, or the wavelengths of a colour, wash them out.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import contourpy
 import numpy as np
@@ -35,6 +36,8 @@ from dolens.diffraction.wavefront import MM_PER_NM
 _CELLS, _DEPTH = 192, 0.75
 # A corner: degrees of a turn, and how many times those beside it.
 _CORNER, _SHARPER = 4.0, 4.0
+# Radians: a side that turns more has no streak, and nor has light farther from a side's normal.
+_CURVED, _BESIDE = 0.3, 0.15
 # Difference for slopes, of the pupil's width.
 _STEP = 1e-4
 # Where the table of sinc² ends, and its points.
@@ -54,6 +57,7 @@ class PupilEdge:
         side_lengths: (sides,), infinite of a smooth edge that is closed.
         corners: (sides, 2, 2), angles (radians) of the own normal and of the neighbour's in the
             corners at both ends; NaN of a closed one.
+        turns: (sides,), radians, by which the normal of each side turns in all.
         width: the smaller extent of the light in direction cosines.
         wavelength: nm, in the medium before the sensor.
     """
@@ -65,6 +69,7 @@ class PupilEdge:
     side: Tensor
     side_lengths: Tensor
     corners: Tensor
+    turns: Tensor
     width: float
     wavelength: float
 
@@ -102,23 +107,42 @@ def pupil_edge(fit: PupilFit, flux: Tensor) -> PupilEdge | None:
     sides = torch.tensor([0] + [len(part.side_lengths) for part in parts]).cumsum(0)
     place = torch.cat([part.place for part in parts])
     opd, amplitude = _functions(fit, place.flatten(0, 1))
+    normals = torch.cat([part.normals for part in parts])
+    side = torch.cat([p.side + first for p, first in zip(parts, sides, strict=False)])
     return PupilEdge(
-        normals=torch.cat([part.normals for part in parts]),
+        normals=normals,
         intercepts=opd.unflatten(0, (-1, 2)),
         density=amplitude.square().unflatten(0, (-1, 2)).mean(-1) / flux,
         lengths=(place[:, 1] - place[:, 0]).norm(dim=-1),
-        side=torch.cat([p.side + first for p, first in zip(parts, sides, strict=False)]),
+        side=side,
         side_lengths=torch.cat([part.side_lengths for part in parts]),
         corners=torch.cat([part.corners for part in parts]),
+        turns=_turns(normals.detach(), side, int(sides[-1])),
         width=float((fit.high - fit.low).detach().amin()),
         wavelength=float(fit.wavefront.wavelength / fit.wavefront.index),
     )
 
 
+class DiffractedLight(NamedTuple):
+    """Points where light lands that an edge diffracts.
+
+    Attributes:
+        points: (N, 2), mm from the pupil's centre on the sensor.
+        light: (N,), of the pupil's flux.
+        distance: (N,), mm, from the edge rays' intercepts; no gradient.
+        smooth: (N,), bool: it belongs to no streak.
+    """
+
+    points: Tensor
+    light: Tensor
+    distance: Tensor
+    smooth: Tensor
+
+
 def diffracted_light(
     edge: PupilEdge, nearest: float, farthest: float, count: int, band: tuple[float, float]
-) -> tuple[Tensor, Tensor]:
-    """Return points where light lands that an edge diffracts, the same at each call.
+) -> DiffractedLight:
+    """Find points where light lands that an edge diffracts, the same at each call.
 
     Distances are even in their logarithm.
 
@@ -128,10 +152,6 @@ def diffracted_light(
         farthest: mm.
         count: N.
         band: shortest and longest wavelength over the edge's own.
-
-    Returns:
-        Points (N, 2), mm from the pupil's centre on the sensor, and the light of each (N,), of
-        the pupil's flux.
     """
     ends = edge.lengths.detach().cumsum(0)
     # Scrambled, lest neighbouring points of a regular lattice show as stripes.
@@ -165,7 +185,17 @@ def diffracted_light(
     # Of dl·dr: the edge's length over how many, and r·reach; both signs.
     factor = kept * weight * corners * cosine * wave * reach / (2.0 * math.pi**2 * r) / count
     light = factor * edge.density[piece] * edge.lengths[piece] / edge.lengths.detach()[piece]
-    return points, light * ends[-1]
+    beside = edge.turns[side] > _CURVED
+    smooth = beside | (sine.detach().abs() > _BESIDE)
+    return DiffractedLight(points, light * ends[-1], r, smooth)
+
+
+def _turns(normals: Tensor, side: Tensor, count: int) -> Tensor:
+    """Return by how much (radians) normals of pieces (M, 2, 2) turn along each side, (count,)."""
+    first, last = normals.unbind(1)
+    cross = first[:, 0] * last[:, 1] - first[:, 1] * last[:, 0]
+    turn = torch.atan2(cross, (first * last).sum(-1)).abs()
+    return turn.new_zeros(count).index_add(0, side, turn)
 
 
 @torch.no_grad()

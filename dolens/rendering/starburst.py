@@ -35,8 +35,12 @@ logger = logging.getLogger(__name__)
 _NEAREST, _WINDOW, _WIDEST, _FINEST = 2.0, 4.0, 65, 2048
 # Samples across the pupil, for its flux.
 _SAMPLES = 256
-# Points where the edge's light lands.
-_POINTS = 1 << 17
+# Points where the edge's light lands on a sensor that reaches so many pixels from it, lest streaks
+# be grainy at their ends.
+_POINTS, _REACH = 1 << 17, 400.0
+# Of these, in a cell; and the largest cell, over its distance from the light.
+_POINTS_A_CELL, _FINE = 30.0, 0.15
+_GOLDEN = 0.6180339887498949
 # Wavelengths of a colour near the image, as shares of its band.
 _COLOURS = (1.0 / 6.0, 0.5, 5.0 / 6.0)
 # Of white: what shows.
@@ -50,6 +54,8 @@ class Starburst(NamedTuple):
         rows: (N,), pixels, where the edge's light lands.
         columns: (N,).
         light: (N,).
+        cell: (N,), int64, pixels: the side of cells over which each is spread, lest light beside
+            streaks be grainy.
         beyond: share of the light among these, which rays do not keep.
         window: (K, K), pixels about the image, which take the place of all else there; None: rays.
         corner: row and column of its first pixel.
@@ -58,6 +64,7 @@ class Starburst(NamedTuple):
     rows: Tensor
     columns: Tensor
     light: Tensor
+    cell: Tensor
     beyond: Tensor
     window: Tensor | None
     corner: tuple[int, int]
@@ -124,17 +131,17 @@ def starburst(
     )
     nearest = _NEAREST * fringe
     share = band[0] / wavelength, band[1] / wavelength
-    landed, light = diffracted_light(
-        edge, nearest, max(corner * pitch, 4.0 * nearest), _POINTS, share
-    )
-    rows, columns = sensor.pixels(*(landed + front.centre).unbind(-1))
+    count = _POINTS << max(0, math.ceil(math.log2(corner / _REACH)))
+    farthest = max(corner * pitch, 4.0 * nearest)
+    found = diffracted_light(edge, nearest, farthest, count, share)
+    rows, columns = sensor.pixels(*(found.points + front.centre).unbind(-1))
     lit = front.coverage >= 0.5
     spot = float(torch.where(lit, front.intercept.detach().norm(dim=-1), 0.0).amax())
     size = 2 * math.ceil((_WINDOW * fringe + spot) / pitch) + 3
     middle = round(row), round(column)
     colours = [band[0] + c * (band[1] - band[0]) for c in _COLOURS] if band[0] < band[1] else []
     window = _window(system, sensor, point, colours or [wavelength], middle, size)
-    whole = light.sum() + edge.beyond(corner * pitch)
+    whole = found.light.sum() + edge.beyond(corner * pitch)
     logger.info(
         "starburst: %.3g of the light %s is diffracted; near the image %s",
         float(edge.beyond(1.5 * pitch)),
@@ -144,11 +151,30 @@ def starburst(
     return Starburst(
         rows,
         columns,
-        light,
+        found.light,
+        _cells(found.distance / pitch, found.smooth),
         whole,
         None if window is None else window / flux,
         (middle[0] - size // 2, middle[1] - size // 2),
     )
+
+
+def _cells(distance: Tensor, smooth: Tensor) -> Tensor:
+    """Return the side of cells that hold enough of the smooth points, octave by octave of distance.
+
+    Args:
+        distance: (N,), pixels.
+        smooth: (N,), bool.
+    """
+    # Octaves fade into each other, so that no edge between cells of two sizes shows.
+    step = torch.arange(len(distance), dtype=torch.float64, device=distance.device)
+    octave = (distance.log2() + (_GOLDEN * step).frac() - 0.5).floor().long().clamp(min=0)
+    count = torch.bincount(octave[smooth], minlength=int(octave.max()) + 1).double()
+    # Between r and 2r, of r = 2^octave.
+    r = 2.0 ** torch.arange(len(count), dtype=torch.float64, device=distance.device)
+    side = (_POINTS_A_CELL * 3.0 * math.pi * r * r / count.clamp(min=1.0)).sqrt()
+    cell = 2 ** torch.minimum(side, _FINE * r).clamp(min=1.0).log2().round().long()
+    return torch.where(smooth, cell[octave], 1)
 
 
 def _window(

@@ -164,7 +164,11 @@ def _with_starburst(
     rows: Tensor, columns: Tensor, light: Tensor, star: Starburst, shape: tuple[int, int]
 ) -> Tensor:
     """Return the image (height, width) of a light of unit power: of its rays and its edge."""
-    image = _on_pixels(1, [(star.rows, star.columns, star.light)], shape)
+    image = torch.zeros(shape, dtype=torch.float64, device=star.light.device)
+    for cell in star.cell.unique().tolist():
+        own = star.cell == cell
+        part = (star.rows[own], star.columns[own], star.light[own])
+        image = image + _on_pixels(cell, [part], shape)
     if star.window is None:
         kept = (1.0 - star.beyond) * light / light.sum()
         return image + _on_pixels(1, [(rows, columns, kept)], shape)

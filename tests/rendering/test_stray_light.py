@@ -13,6 +13,7 @@ from dolens.rendering.starburst import bands, starburst
 from dolens.rendering.stray_light import Light, light_on_sensor, lights_of, veil
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
+from tests.diffraction.perfect_lenses import hyperbola
 
 GREEN = 550.0
 # 18 mm by 18 mm behind a triplet of f = 50 mm.
@@ -143,6 +144,24 @@ def test_waves_near_the_light_meet_the_edge_s_light_farther_out(starry):
     assert float(star.window.sum() + star.light[outside > half + 0.5].sum()) == pytest.approx(
         1.0, abs=0.01
     )
+
+
+def test_a_round_stop_s_halo_falls_off_with_the_cube_of_the_distance():
+    """The mean of Airy's rings, λN/(π³r³), over all azimuths, and smooth from pixel to pixel."""
+    lens, pitch = hyperbola(50.0, 3.125), 0.02
+    fine = ImagingSystem.of(lens.system(), PlanarScene((FAR,), (GREEN,)), Sensor(161, 161, pitch))
+    own, ghosts_alone = (
+        light_on_sensor(lens, fine, 0, [light(80, 80, 1e6)], rays=400, diffraction=d)[0]
+        for d in (True, False)
+    )
+    at = torch.arange(-80.0, 81.0, dtype=torch.float64)
+    r = pitch * torch.hypot(at[:, None], at)
+    share = (own - ghosts_alone) / own.sum()
+    for low, high in ((15, 20), (30, 40), (60, 78)):
+        ring = (r > low * pitch) & (r < high * pitch)
+        known = 1e-6 * GREEN * 8.0 * pitch**2 / (math.pi**3 * r[ring] ** 3)
+        assert float(share[ring].sum() / known.sum()) == pytest.approx(1.0, abs=0.04)
+        assert float((share[ring] / known).std()) < 0.15
 
 
 def test_where_no_starburst_shows_nothing_changes(starry, caplog):
