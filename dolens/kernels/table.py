@@ -12,6 +12,7 @@ fixed slots and then the numbers of its shape.
 Positions count from the vertex at hand, along the axes of the surface at hand.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -268,3 +269,16 @@ LONGEST = 2.0
 STEEPEST = 1e6
 # |a·N| ≤ n/n' + |g| is below this: it holds rays in range whose directions are no unit vectors.
 LONGEST_WAVEVECTOR = 2.0 * STEEPEST
+
+# Kicks and drifts of a step in a gradient-index medium, which take turns; each reads the same
+# backwards (Blanes and Moan, SRKN 11).
+_HALF = (
+    *(0.0414649985182624, 0.198128671918067, -0.0400061921041533),
+    *(0.0752539843015807, -0.0115113874206879),
+)
+KICKS = (*_HALF, *(2 * (0.5 - math.fsum(_HALF),)), *_HALF[::-1])
+_HALF = (
+    *(0.123229775946271, 0.290553797799558, -0.127049212625417),
+    *(-0.246331761062075, 0.357208872795928),
+)
+DRIFTS = (*_HALF, 1.0 - 2.0 * math.fsum(_HALF), *_HALF[::-1])

@@ -7,11 +7,15 @@ those of the point of intersection.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from dolens.kernels.operators import is_eager
+from dolens.optics.autograd import is_transformed
 from dolens.optics.elements import (
     Axes,
     from_lens_axes,
@@ -29,6 +33,42 @@ _APPROACHES, _SHARE = 6, 8
 _LEAST, _LARGEST = 1e-6, 1e4
 
 
+# Of fewer rays PyTorch's operations are at their end before a kernel is compiled.
+_FEW = 1024
+
+
+class _Carry(torch.autograd.Function):
+    """Rays are carried through a gradient by the CPU's kernel; first derivatives only."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int
+    ) -> Tensor:
+        """Carry (7, N), and keep the end."""
+        end: Tensor = _kernels().carry(
+            motion.clone(), t, base, medium.coefficients, medium.squared, steps
+        )
+        ctx.save_for_backward(end, t, base)
+        ctx.medium, ctx.steps = medium, steps
+        return end
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        """Take cotangents back to the beginning."""
+        end, t, base = ctx.saved_tensors
+        medium = ctx.medium
+        of_motion, of_base = _kernels().carry_adjoint(
+            *(end, cotangent.contiguous().clone(), t, base),
+            *(medium.coefficients, medium.squared, ctx.steps),
+        )
+        return of_motion, None, of_base if base.numel() > 1 else of_base.sum(0, True), None, None
+
+
+def _kernels() -> Any:
+    return import_module("dolens.kernels.cpu.bent")
+
+
 @dataclass(frozen=True)
 class Space:
     """The gap behind a surface is filled with a gradient.
@@ -39,6 +79,7 @@ class Space:
         axes: of the surface in front, from which the profile counts.
         steps: that a ray takes through it.
         reach: of its profile, mm: a ray that is farther away is lost.
+        kernels: whether the CPU's kernels may carry rays.
     """
 
     medium: Gradient
@@ -46,6 +87,7 @@ class Space:
     axes: Axes
     steps: int
     reach: float
+    kernels: bool = False
 
     def bend(self, x: Number, y: Number, z: Number) -> Bend:
         """Return n² and its half gradient at points along `axes`, mm."""
@@ -80,7 +122,7 @@ class Space:
             t, kept = t.detach(), kept.detach()
         # A ray that is lost stays at the vertex: nothing infinite comes into the derivatives.
         x, y, z = (part.masked_fill(~kept, 0.0) for part in start[:3])
-        end = carry(self.bend, self._motion(start._replace(x=x, y=y, z=z)), t, self.steps)
+        end = self._carried(self._motion(start._replace(x=x, y=y, z=z)), t, self.steps)
         found, rest, force = self._meeting(end, then, meet)
         speeds = zip(end[3:6], (force.x, force.y, force.z), strict=True)
         cosines = _unit(*(speed + rest * slope for speed, slope in speeds))
@@ -114,6 +156,18 @@ class Space:
         points = (carry(self.bend, start, share * t, self.steps)[:3] for share in shares)
         return [points_to_lens_axes(point, self.axes) for point in points]
 
+    def _carried(self, motion: Motion, t: Tensor, steps: int) -> Motion:
+        """Return rays that are carried on by t."""
+        if not self.kernels or t.numel() < _FEW or is_transformed() or not is_eager([t]):
+            return carry(self.bend, motion, t, steps)
+        base = torch.as_tensor(self.base, dtype=t.dtype, device=t.device)
+        if base.numel() > 1:
+            base = base.expand(t.shape)
+        parts = torch.stack(torch.broadcast_tensors(*motion))
+        given = (parts.reshape(7, -1), t.reshape(-1).contiguous(), base.reshape(-1).contiguous())
+        end = _Carry.apply(*given, self.medium, steps)
+        return Motion(*end.reshape(7, *t.shape))
+
     def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         x, y, z = (part.clamp(-self.reach, self.reach) for part in (x, y, z))
         squared = self.bend(x, y, z).squared + torch.zeros_like(x)
@@ -142,7 +196,7 @@ class Space:
         _, rest, _ = self._meeting(start, then, meet)
         t, motion, steps = torch.zeros_like(rest), start, self.steps
         for _ in range(_APPROACHES):
-            t, motion = t + rest, carry(self.bend, motion, rest, steps)
+            t, motion = t + rest, self._carried(motion, rest, steps)
             steps = max(1, self.steps // _SHARE)
             _, rest, force = self._meeting(motion, then, meet)
         t = t + rest

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from dolens.kernels.table import DRIFTS, KICKS
 from dolens.optics.autograd import is_transformed
 
 Number = Any  # of Python's, or a tensor
@@ -29,17 +30,6 @@ AXIAL = ("z", "z2", "z3", "z4")
 ACROSS = ("x", "x2", "y", "y2")
 TERMS = (*RADIAL, *AXIAL, *ACROSS)
 
-# Kicks and drifts of a step, which take turns; each list reads the same backwards.
-_HALF = (
-    *(0.0414649985182624, 0.198128671918067, -0.0400061921041533),
-    *(0.0752539843015807, -0.0115113874206879),
-)
-_KICKS = (*_HALF, *(2 * (0.5 - math.fsum(_HALF),)), *_HALF[::-1])
-_HALF = (
-    *(0.123229775946271, 0.290553797799558, -0.127049212625417),
-    *(-0.246331761062075, 0.357208872795928),
-)
-_DRIFTS = (*_HALF, 1.0 - 2.0 * math.fsum(_HALF), *_HALF[::-1])
 # So many rays are traced once more for their derivatives, whose memory is then that of a step.
 _MANY = 4096
 # Steps per radian of phase, of which a parabolic profile has 2π a pitch, and the fewest: they err
@@ -107,6 +97,11 @@ class Gradient:
                 tuple(self._coefficients.get(n, 0.0) for n in names[: max(given, default=0)])
             )
         return tuple(found)
+
+    @cached_property
+    def coefficients(self) -> tuple[float, ...]:
+        """Return the coefficients of all terms, in the order of `TERMS`."""
+        return tuple(self._coefficients.get(term, 0.0) for term in TERMS)
 
     @cached_property
     def axial(self) -> bool:
@@ -182,10 +177,10 @@ def carry(
         steps: one or more.
     """
     h = t / steps
-    motion = _kicked(bend, start, _KICKS[0] * h)
+    motion = _kicked(bend, start, KICKS[0] * h)
 
     def step(motion: Motion, last: float) -> Motion:
-        for drift, kick in zip(_DRIFTS, (*_KICKS[1:-1], last), strict=True):
+        for drift, kick in zip(DRIFTS, (*KICKS[1:-1], last), strict=True):
             motion = _kicked(bend, _drifted(motion, drift * h), kick * h)
         return motion
 
@@ -197,7 +192,7 @@ def carry(
     )
     for k in range(steps):
         # The last kick of a step and the first of the next are one.
-        last = (2.0 if k + 1 < steps else 1.0) * _KICKS[0]
+        last = (2.0 if k + 1 < steps else 1.0) * KICKS[0]
         if replays:
             motion = checkpoint(step, motion, last, use_reentrant=False, preserve_rng_state=False)
         else:

@@ -332,8 +332,11 @@ def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) ->
         others: tensors that enter the computation besides the lens's own.
 
     Returns:
-        The same lens with `reference`, `cpu` or `cuda` as its `backend`.
+        The same lens with `reference`, `cpu` or `cuda` as its `backend`; itself where a medium is a
+        gradient, whose kernel is a part of the reference's trace.
     """
+    if system.gradients and system.backend == "auto":
+        return system
     return system.traced_by(choose_backend(system, others=others))
 
 

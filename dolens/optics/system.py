@@ -162,6 +162,8 @@ class OpticalSystem:
         if not self.gradients:
             return {}
         indices, axes, found = self.indices(wavelength), self.axes, {}
+        kernels = self.backend == "auto" and self.device.type == "cpu"
+        kernels = kernels and self.dtype in (torch.float32, torch.float64)
         for place, origin in self.gradients.items():
             medium, n = self.materials[place], indices[place]
             assert isinstance(medium, Gradient)  # as its place says
@@ -169,7 +171,7 @@ class OpticalSystem:
             start, length = map(plain, gap_of_gradient(self.thicknesses, origin, place))
             steps = steps_through(medium, plain(n), start, length, radius, self.dtype)
             reach = _REACH * (radius + abs(start) + abs(length))
-            found[place] = Space(medium, n, axes[origin - 1], steps, reach)
+            found[place] = Space(medium, n, axes[origin - 1], steps, reach, kernels)
         return found
 
     def paraxial_gaps(self, wavelength: float | Tensor) -> list[Tensor | BentGap]:
