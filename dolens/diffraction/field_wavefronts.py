@@ -14,7 +14,7 @@ from dolens.diffraction.field_pupil import FieldPupil
 from dolens.diffraction.pupil_fit import dilated
 from dolens.diffraction.wavefront import Wavefront, coverage, pupil_wavefront
 from dolens.optics.lens import Lens
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_seen_by_rays
 
 # Rays along each side of the beam that find where the light lands.
 _COARSE = 16
@@ -51,6 +51,7 @@ def field_wavefronts(lens: Lens, where: Conditions, samples: int = 32) -> FieldW
         InputError: a sphere that cannot be placed.
     """
     system = lens.system().double()
+    require_seen_by_rays(system, "wavefronts")
     field, waves = where.fields.to(system.device), where.wavelengths.to(system.device)
     spectrum = where.weights.to(field)
     shape = (len(field), len(waves))

@@ -314,6 +314,36 @@ def relief_efficiencies(
     return torch.stack(rows)
 
 
+def order_efficiencies(
+    lens: Any,
+    orders: Sequence[int],
+    wavelengths: Sequence[float] | None = None,
+    surface: int | None = None,
+) -> Tensor:
+    """Return the share of light that the element of a lens sends into orders, (W, orders).
+
+    Args:
+        lens: a `Lens`.
+        orders: m; that of rays is the phase's `order`.
+        wavelengths: nm; None: the lens's own.
+        surface: number of the element's surface; None: the first that is diffractive.
+
+    Raises:
+        InputError: there is no element, or none that makes a phase.
+    """
+    system = lens.system()
+    number = surface or next(iter(system.diffractive), 0)
+    if number not in system.diffractive:
+        raise InputError(f"lens '{lens.name}': there is no diffractive element to take orders of")
+    law = system.surfaces[number - 1].deflection
+    if law is None:
+        raise InputError(f"lens '{lens.name}': surface {number} has no 'phase', and so no orders")
+    waves = wavelengths or lens.wavelengths or (lens.primary_wavelength,)
+    media = system.materials[number - 1], system.materials[number]
+    blaze = round(float(law.parameters["order"].detach()))
+    return relief_efficiencies(system.surfaces[number - 1].relief, orders, waves, media, blaze)
+
+
 def lens_phase(
     focal_length: float,
     wavelength: float,

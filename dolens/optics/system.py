@@ -545,3 +545,16 @@ def require_plane_sensor(system: OpticalSystem, what: str) -> None:
         raise InputError(
             f"{what}: the sensor is curved (radius {radius:g} mm); only a plane one is held there"
         )
+
+
+def require_seen_by_rays(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where a lens has a diffractive element without a phase; arguments as above.
+
+    Rays follow an element's phase in one order; heights of pixels or rings alone bend none.
+    """
+    for number in system.diffractive:
+        if system.surfaces[number - 1].deflection is None:
+            raise InputError(
+                f"{what}: surface {number} is diffractive by its heights alone, which rays do not "
+                "see; waves do (lens.psf, lens.mtf, renderer psf with diffraction: wave)"
+            )

@@ -24,7 +24,7 @@ from dolens.diffraction.pixel_psf import (
 )
 from dolens.diffraction.propagation import MOST_SAMPLES, DiffractionSettings, TooSteepError
 from dolens.optics.ray_tracing import cpu_kernels_serve
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_seen_by_rays
 from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import (
@@ -113,6 +113,7 @@ def field_point_spread_functions(
     pixels look has to carry its own (`convolve_patches`).
     """
     system = imaging.system
+    require_seen_by_rays(system, "renderer psf")
     places = _places(points, among, system.rotationally_symmetric)
     disc = sampled_disc(places, pupil_samples, seed, system)
     seen = plane_points(imaging, points, disc)
@@ -364,6 +365,8 @@ def place_functions(
         Differentiable in the lens, in its precision.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
+    if diffraction != "wave":
+        require_seen_by_rays(system, "point spread functions")
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), samples, 0, system)
     seen = plane_points(imaging, points, disc)
     down = seen.rows - ideal.rows[..., None, None].to(seen.rows)

@@ -20,7 +20,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
 from dolens.optics.ray_tracing import say_once, trace_components, with_chosen_backend
 from dolens.optics.rays import Components
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, require_seen_by_rays
 from dolens.optics.trace import distance_to_plane
 from dolens.rendering.aperture_edges import (
     EdgeRays,
@@ -169,6 +169,7 @@ class RayRenderer(Renderer):
         backend = system.backend
         still = lens.system({n: p.detach() for n, p in parameters.items()}).uncoated()
         now = still.traced_by(backend)
+        require_seen_by_rays(now, "renderer rays")
         scene.check(now)
         pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, axial)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)

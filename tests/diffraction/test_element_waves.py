@@ -16,7 +16,7 @@ from dolens.diffraction.pixel_psf import PixelWindow, propagation, wave_kernels
 from dolens.diffraction.point_spread import point_spread
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
-from dolens.optics.diffractive import lens_phase
+from dolens.optics.diffractive import lens_phase, order_efficiencies
 from dolens.prescriptions.build import lens_from_prescription
 
 GLASS = "1.4585/67.8"
@@ -312,3 +312,17 @@ def test_the_choice_of_propagation_is_said():
     assert bool(found.fourier.all())
     wide = propagation(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.02, 65))
     assert wide.reasons[0].startswith("spectrum: ")
+
+
+def test_rays_refuse_what_they_do_not_see():
+    lens = plate({"rings": [1.0], "pitch": 0.1})
+    with pytest.raises(InputError, match="surface 2 is diffractive by its heights alone"):
+        lens.strehl()
+    assert element_light(lens.system(), ON_AXIS, 550.0, [[0.0, 0.0]]).law is None
+
+
+def test_orders_of_a_lens_are_told():
+    found = order_efficiencies(kinoform(levels=4), [1, 5], [550.0])
+    np.testing.assert_allclose(found.numpy(), [np.sinc([1 / 4, 5 / 4]) ** 2], atol=1e-12)
+    with pytest.raises(InputError, match="has no 'phase', and so no orders"):
+        order_efficiencies(plate({"rings": [1.0], "pitch": 0.1}), [1])

@@ -87,7 +87,8 @@ class Survey:
     def waves(self, size: int, distortion: bool) -> Tensor:
         """Functions (N, D, C, size, size) with diffraction, of the same points."""
         # Near enough for a plan; direct integration would take minutes.
-        settings = DiffractionSettings(method="fourier")
+        fast = "auto" if self.imaging.system.diffractive else "fourier"
+        settings = DiffractionSettings(method=fast)
         found = wave_point_spread_functions(self.imaging, self.points, size, distortion, settings)
         return found.functions
 

@@ -205,8 +205,11 @@ def _diffraction(
         for channel, wavelength in enumerate(scene.wavelengths)
     ]
     error = float(torch.stack(errors).square().mean().sqrt())
-    if error <= _DIFFRACTION * tolerance:
+    element = bool(truth.imaging.system.diffractive)
+    if error <= _DIFFRACTION * tolerance and not element:
         return Decision("diffraction", "none", error, seen), error
+    if element:
+        seen = f"{seen}; a diffractive element has other orders than rays'"
     sensor, distortion = renderer.sensor, renderer.registration == "chief_rays"
     # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
     share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
@@ -234,7 +237,7 @@ def _diffraction(
     )
     if without <= _DIFFRACTION * tolerance:
         return Decision("diffraction", "none", without, f"{seen}; measured by waves"), without
-    if with_limit <= _DIFFRACTION * tolerance:
+    if with_limit <= _DIFFRACTION * tolerance and not element:
         because = f"{seen}; measured by waves; without it {without:.2g}"
         return Decision("diffraction", "limit", with_limit, because), without
     because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"

@@ -1,0 +1,66 @@
+"""Photographs through diffractive elements: all orders, where rays see the first."""
+
+import pytest
+import torch
+
+from dolens.errors import InputError
+from dolens.optics.diffractive import lens_phase
+from dolens.prescriptions.build import lens_from_prescription
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+SENSOR = Sensor(64, 64, 0.004)
+SCENE = PlanarScene(depths=(1000.0,), wavelengths=(550.0,))
+
+
+def flat_lens(dtype=torch.float64, **diffractive):
+    surfaces = {
+        "1": {"type": "plane", "semi_diameter": 1.0, "thickness": 0.5, "material": "1.4585/67.8"},
+        "2": {"type": "plane", "semi_diameter": 0.5, "material": "air",
+              "phase": lens_phase(8.0, 550.0, 0.5),
+              "diffractive": {"design_wavelength": 550, **diffractive}},
+    }  # fmt: skip
+    given = {"stop": 2, "surfaces": surfaces, "sensor": {"distance": 8.06, "diameter": 0.4}}
+    return lens_from_prescription(given, dtype)
+
+
+def texture():
+    rows, columns = torch.meshgrid(*2 * (torch.arange(96, dtype=torch.float64),), indexing="ij")
+    bars = 0.5 + 0.5 * torch.sign(torch.sin(0.35 * columns) * torch.sin(0.2 * rows))
+    return bars.expand(1, 1, 96, 96)
+
+
+def test_at_the_design_wavelength_the_relief_is_the_phase_that_rays_follow():
+    lens = flat_lens()
+    renderer = PsfRenderer(SENSOR, (2, 2), size=33, diffraction="wave")
+    found = renderer.render(lens, SCENE, texture(), 0)
+    lens.surfaces["2"].diffractive = None
+    # Without the relief the wavefront in the exit pupil makes the picture.
+    wanted = renderer.render(lens, SCENE, texture(), 0)
+    # What the window loses is lost; the other way gives it back in proportion, some 1.6 % here.
+    share = float(found.mean() / wanted.mean())
+    assert 0.97 < share < 1.0
+    assert float((found - share * wanted).square().mean().sqrt()) < 0.002
+    rays = RayRenderer(SENSOR, 8).render(lens, SCENE, texture(), 0)
+    assert float(found.mean()) == pytest.approx(float(rays.mean()), rel=0.05)
+
+
+def test_light_of_other_orders_is_lost_to_the_picture_and_levels_have_gradients():
+    lens = flat_lens(torch.float32)
+    coarse = flat_lens(torch.float32, levels=2)
+    renderer = PsfRenderer(SENSOR, (1, 1), size=33, diffraction="wave")
+    whole, binary = (renderer.render(one, SCENE, texture(), 0) for one in (lens, coarse))
+    # Two levels send 40.5 % into the first order; others are spread over a wide disc.
+    assert 0.38 < float(binary.mean() / whole.mean()) < 0.47
+    (slope,) = torch.autograd.grad(binary.square().mean(), coarse.surfaces["2"].phase.p4)
+    assert float(slope) != 0.0
+
+
+def test_rays_do_not_show_heights_alone():
+    lens = flat_lens()
+    surface = lens.surfaces["2"]
+    surface.phase = None
+    with pytest.raises(InputError, match="heights alone, which rays do not see"):
+        RayRenderer(SENSOR, 4).render(lens, SCENE, texture(), 0)
