@@ -37,7 +37,6 @@ from dolens.optics.system import OpticalSystem
 
 # Smallest slope along one axis of a grid over that along the other: an edge along the grid.
 _ALONG = 1e-3
-_TINY = 1e-100
 
 
 def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | None = None) -> Tensor:
@@ -102,7 +101,9 @@ def covered(margin: Tensor) -> Tensor:
         slopes.append(((behind - before) / (back + ahead)).abs())
         mean = mean + torch.where(back + ahead == 2, before + behind - 2.0 * m, 0.0) / 24.0
     a, b = slopes
-    steepest = torch.maximum(a, b).detach().clamp(min=_TINY)
+    # Products of two of them do not vanish in the precision.
+    tiny = torch.finfo(m.dtype).tiny ** 0.25
+    steepest = torch.maximum(a, b).detach().clamp(min=tiny)
     a, b = torch.maximum(a, _ALONG * steepest), torch.maximum(b, _ALONG * steepest)
     wide, narrow = 0.5 * (a + b), 0.5 * (a - b)
     # Far from the edge the squares would cancel where they must not.

@@ -548,7 +548,7 @@ def require_plane_sensor(system: OpticalSystem, what: str) -> None:
 
 
 def require_seen_by_rays(system: OpticalSystem, what: str) -> None:
-    """Raise `InputError` where a lens has a diffractive element without a phase; arguments as above.
+    """Raise `InputError` where an element of a lens has heights and no phase; arguments as above.
 
     Rays follow an element's phase in one order; heights of pixels or rings alone bend none.
     """

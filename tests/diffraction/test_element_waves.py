@@ -326,3 +326,23 @@ def test_orders_of_a_lens_are_told():
     np.testing.assert_allclose(found.numpy(), [np.sinc([1 / 4, 5 / 4]) ** 2], atol=1e-12)
     with pytest.raises(InputError, match="has no 'phase', and so no orders"):
         order_efficiencies(plate({"rings": [1.0], "pitch": 0.1}), [1])
+
+
+def test_square_light_is_even_in_single_precision():
+    square = {"half_width_x": 0.2, "half_width_y": 0.2}
+    back = {
+        "type": "plane",
+        "aperture": square,
+        "material": "air",
+        "phase": lens_phase(8, 550, 0.3),
+    }
+    rows = {"1": {**back, "diffractive": {"design_wavelength": 550, "material": GLASS}}}
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 8}}, torch.float32)
+    found = wave_kernels(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.004, 129))[0].detach()
+    line = found[64] / found[64].max()
+    # A pixel's box and a texel's tent blur sinc² of 11 µm.
+    x = (torch.arange(129 * 64, dtype=torch.float64) - 64 * 64.5 + 0.5) / 64
+    spline = torch.where(x.abs() < 0.5, 0.75 - x * x, 0.5 * (1.5 - x.abs()).clamp(min=0).square())
+    sinc = torch.sinc(0.4 * 0.004 * x / (8 * 550e-6)).square()
+    blurred = np.convolve(sinc.numpy(), spline[64 * 62 : 64 * 67].numpy(), mode="same")[31::64]
+    assert np.abs(line.numpy() - blurred / blurred.max()).max() < 0.02
