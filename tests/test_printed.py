@@ -307,6 +307,7 @@ FRAGMENTS = {
     "docs/coatings.md: coating: quarter_wave": a_lens,
     "docs/conventions.md: '3': {type: coordinate_break": a_lens,
     "docs/ghosts.md: views:": lights,
+    "docs/diffractive.md: surfaces:": a_plain_lens,
     "docs/ghosts.md: variables:": partial(a_design, name="double_gauss"),
     "docs/glass.md: temperature: 60": a_lens,
     "docs/glass.md: surfaces:": a_lens,

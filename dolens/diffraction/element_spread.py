@@ -116,15 +116,16 @@ def mean_irradiance(
 
 
 @torch.no_grad()
-def element_sampling_error(light: ElementLight, weights: Tensor, half: float, cells: int) -> float:
-    """Return the largest change of the irradiance by a second computation on a finer grid of the
-    element (pixels in two), over its peak; NaN where that has too many cells.
+def element_sampling_error(
+    light: ElementLight, weights: Tensor, half: float, means: Tensor
+) -> float:
+    """Return the largest change of means of the irradiance by a second computation, on a finer grid
+    of the element (pixels in two), over its peak; NaN where that has too many cells.
     """
-    coarse, *_ = mean_irradiance(light, weights, half, cells)
     count = max(light.plan(n, half).count for n in range(len(light)))
     settings = replace(light.settings, samples=math.ceil(_FINER * count))
     try:
-        finer, *_ = mean_irradiance(replace(light, settings=settings), weights, half, cells)
+        finer, *_ = mean_irradiance(replace(light, settings=settings), weights, half, len(means))
     except InputError:
         return math.nan
-    return float((finer - coarse).abs().amax() / finer.amax())
+    return float((finer - means).abs().amax() / finer.amax())

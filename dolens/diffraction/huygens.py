@@ -95,6 +95,8 @@ def huygens_point_spread(
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
+    if lens.system().diffractive:
+        raise InputError("kind huygens: the lens has a diffractive element; allowed: fourier")
     where = where.that_count()
     found = field_wavefronts(lens, where)
     weights = where.weights.to(lens.device)

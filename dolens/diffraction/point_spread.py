@@ -170,7 +170,7 @@ def _behind_element(
         means, peak, perfect = mean_irradiance(light, where.weights, half, cells)
         held = float(means.sum()) * (2.0 * half / cells) ** 2
         reason = light.plan(len(light) - 1, half).reason
-        error = element_sampling_error(light, where.weights, half, cells)
+        error = element_sampling_error(light, where.weights, half, means)
         how = peak / perfect, True, reason, error
         rows.append(FieldPointSpread(1e3 * half, 1e-6 * means, held, *how))
     radius = airy[0] if airy else math.nan
