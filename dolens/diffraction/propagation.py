@@ -353,25 +353,36 @@ def _added(wavefront: Wavefront, n: int, x: Tensor, y: Tensor, dtype: torch.dtyp
     parts = list(zip(x.split(size), y.split(size), strict=True))
 
     def piece(i: int, *rays: Tensor) -> Tensor:
-        return _summed(*parts[i], rays, sphere, dtype)
+        return wavelets(*parts[i], rays, sphere, dtype).sum(-1)
 
     return replay(piece, [len(part) for part, _ in parts], tensors)
 
 
-def _summed(
+def wavelets(
     x: Tensor,
     y: Tensor,
     rays: tuple[Tensor, ...],
     sphere: tuple[Tensor, ...],
     dtype: torch.dtype,
 ) -> Tensor:
-    """Σ over rays (R,) at points (M,), complex."""
+    """Return the wavelets of rays at points of the sensor.
+
+    Args:
+        x: (M,), mm from the centre of the reference sphere.
+        y: (M,), mm.
+        rays: directions (R, 2) and OPD (R,), mm, as of `Wavefront`, and weights of the wavelets.
+        sphere: its curvature, 1/mm, the index, and the wavelength, mm.
+        dtype: of moduli and phases.
+
+    Returns:
+        (M, R), complex.
+    """
     direction, opd, weight = rays
     curvature, index, wavelength = sphere
     along = torch.stack((x, y), -1) @ direction.mT
     beyond, ratio = path_beyond(along, (x * x + y * y)[:, None], curvature)
     turns = (opd + index * beyond) / wavelength
-    return _phasor(turns, dtype, weight / ratio).sum(-1)
+    return _phasor(turns, dtype, weight / ratio)
 
 
 def _phasor(turns: Tensor, dtype: torch.dtype, modulus: Tensor | None = None) -> Tensor:

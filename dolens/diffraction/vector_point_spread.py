@@ -26,7 +26,7 @@ from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points, part_of
 from dolens.diffraction.huygens import half_width_of, rays_for
 from dolens.diffraction.jones_pupils import polarised_pupil
-from dolens.diffraction.reference_sphere import path_beyond
+from dolens.diffraction.propagation import wavelets
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
@@ -192,16 +192,12 @@ def added_fields(wavefront: Wavefront, fields: Tensor, x: Tensor, y: Tensor) -> 
     """
     found = []
     for n, wavelength in enumerate(MM_PER_NM * wavefront.wavelength):
-        lit, index = wavefront.coverage[n] > 0.0, wavefront.index[n]
-        direction, opd = wavefront.direction[n][lit], wavefront.opd[n][lit]
-        sources = fields[n][lit] * (wavefront.weight[n][lit] * (index / wavelength))[:, None]
-        pieces = []
-        size = max(1, _CHUNK // max(1, len(opd)))
-        for across, up in zip(x.split(size), y.split(size), strict=True):
-            along = torch.stack((across, up), -1) @ direction.mT
-            square = (across * across + up * up)[:, None]
-            beyond, ratio = path_beyond(along, square, wavefront.curvature[n])
-            phase = (2.0 * torch.pi / wavelength) * (opd + index * beyond)
-            pieces.append(torch.polar(1.0 / ratio, phase) @ sources)
-        found.append(torch.cat(pieces))
+        lit = wavefront.coverage[n] > 0.0
+        sphere = (wavefront.curvature[n], wavefront.index[n], wavelength)
+        weight = wavefront.weight[n][lit] * (wavefront.index[n] / wavelength)
+        rays = (wavefront.direction[n][lit], wavefront.opd[n][lit], weight)
+        parts, size = [], max(1, _CHUNK // max(1, len(weight)))
+        for points in zip(x.split(size), y.split(size), strict=True):
+            parts.append(wavelets(*points, rays, sphere, weight.dtype) @ fields[n][lit])
+        found.append(torch.cat(parts))
     return torch.stack(found)
