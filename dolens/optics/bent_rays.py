@@ -6,7 +6,7 @@ those of the point of intersection.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dolens.kernels.operators import is_eager
+from dolens.kernels.operators import are_plain, is_eager
 from dolens.optics.autograd import is_transformed
 from dolens.optics.elements import (
     Axes,
@@ -101,7 +101,12 @@ class Space:
         )
 
     def cross(
-        self, ray: Components, now: Axes, then: Axes, meet: Callable[[Components], Any]
+        self,
+        ray: Components,
+        now: Axes,
+        then: Axes,
+        meet: Callable[[Components], Any],
+        meet_still: Callable[[Components], Any],
     ) -> tuple[Components, Any, Tensor]:
         """Carry rays through the medium to a surface.
 
@@ -110,6 +115,7 @@ class Space:
             now: where the rays are.
             then: axes of the surface.
             meet: finds where straight rays meet it, as `dolens.optics.trace.meet` does.
+            meet_still: the same of a surface without derivatives; see `still`.
 
         Returns:
             The rays that arrive, in the axes `then`; where they meet the surface; and their optical
@@ -117,9 +123,10 @@ class Space:
         """
         start = _seen_from(ray, now, self.axes)
         with torch.no_grad():
-            still = Components(*(part.detach() for part in start))
-            t, kept = self._time(self._motion(still), then, meet)
-            t, kept = t.detach(), kept.detach()
+            # No derivative is carried along while the place is looked for.
+            held = replace(self, base=still(self.base), axes=still(self.axes))
+            begin = _seen_from(still(ray), still(now), held.axes)
+            t, kept = held._time(held._motion(begin), still(then), meet_still)
         # A ray that is lost stays at the vertex: nothing infinite comes into the derivatives.
         x, y, z = (part.masked_fill(~kept, 0.0) for part in start[:3])
         end = self._carried(self._motion(start._replace(x=x, y=y, z=z)), t, self.steps)
@@ -158,14 +165,19 @@ class Space:
 
     def _carried(self, motion: Motion, t: Tensor, steps: int) -> Motion:
         """Return rays that are carried on by t."""
-        if not self.kernels or t.numel() < _FEW or is_transformed() or not is_eager([t]):
+        searches = is_transformed() and not torch.is_grad_enabled() and are_plain((t, *motion))
+        if not self.kernels or not (searches or (t.numel() >= _FEW and is_eager([t]))):
             return carry(self.bend, motion, t, steps)
         base = torch.as_tensor(self.base, dtype=t.dtype, device=t.device)
         if base.numel() > 1:
             base = base.expand(t.shape)
         parts = torch.stack(torch.broadcast_tensors(*motion))
         given = (parts.reshape(7, -1), t.reshape(-1).contiguous(), base.reshape(-1).contiguous())
-        end = _Carry.apply(*given, self.medium, steps)
+        if searches:
+            medium = self.medium
+            end = _kernels().carry(*given, medium.coefficients, medium.squared, steps)
+        else:
+            end = _Carry.apply(*given, self.medium, steps)
         return Motion(*end.reshape(7, *t.shape))
 
     def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
@@ -204,6 +216,21 @@ class Space:
         for end in motion[:3]:
             kept = kept & (end.abs() < self.reach)
         return t.masked_fill(~kept, 0.0), kept
+
+
+def still(value: Any) -> Any:
+    """Return numbers, or a tuple of them, without derivatives, and out of transforms that do not
+    make many of one.
+    """
+    if isinstance(value, Tensor):
+        value = value.detach()
+        if is_transformed():
+            beneath = torch.func.debug_unwrap(value, recurse=True)
+            value = beneath if beneath.shape == value.shape else value
+        return value
+    if isinstance(value, Axes | Components):
+        return type(value)(*map(still, value))
+    return value
 
 
 def _unit(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:

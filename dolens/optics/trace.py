@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.table import GRAZING
+from dolens.optics.bent_rays import still
 from dolens.optics.crystals import Crystal, refract_at_crystal
 from dolens.optics.elements import (
     LENS_AXES,
@@ -270,7 +271,10 @@ def trace_surfaces(
         towards = partial(meet, surface, sense=arriving, from_the_side=system.from_the_side)
         bent = None
         if front in spaces:
-            here, found, bent = spaces[front].cross(ray, axes, places[i], towards)
+            held = replace(surface, parameters={k: still(v) for k, v in parameters.items()})
+            here, found, bent = spaces[front].cross(
+                *(ray, axes, places[i], towards, partial(towards.func, held, **towards.keywords))
+            )
             carried = None
         else:
             here, carried = change_axes(ray, axes, places[i])

@@ -13,6 +13,7 @@ from dolens.analysis.ray_path import ray_path
 from dolens.optics import bent_rays
 from dolens.optics.gradients import Bend, Gradient, Motion, carry
 from dolens.optics.jacobian import ray_jacobian
+from dolens.optics.lens_family import trace_lenses
 from dolens.optics.materials import index_model, parse_material
 from dolens.optics.paraxial import first_order
 from dolens.optics.paraxial_rays import ParaxialNumbers
@@ -460,3 +461,13 @@ def test_what_does_not_hold_in_a_gradient_is_refused_by_name(tmp_path):
     for suffix in (".zmx", ".seq", ".txt"):
         with pytest.raises(InputError, match="gradient"):
             dolens.save_lens(lens, tmp_path / f"lens{suffix}")
+
+
+def test_many_lenses_are_traced_as_each_alone():
+    lens, rays = thick_lens(distance=6.0), beam(*RAYS["points"], slopes=RAYS["slopes"])
+    names = ["surfaces.1.curvature", "thicknesses.1"]
+    values = torch.tensor([[1.0 / 12.0, 4.0], [1.0 / 13.0, 4.2]], dtype=torch.float64)
+    found, _ = trace_lenses(lens, names, values, rays)
+    for row, y in zip(values, found.y, strict=True):
+        alone = lens.with_values(dict(zip(names, row, strict=True))).trace(rays)
+        close(y, alone.position[:, 1].detach(), 1e-13)
