@@ -102,28 +102,33 @@ def test_a_stop_clips_source_and_mode(share):
     assert float(found.coupling) == pytest.approx(passed**2, abs=3e-4)
 
 
-def test_a_collimated_beam_enters_the_fibre_that_matches_its_focus():
-    """w' = λ·f/(π·w): a stigmatic plano-hyperboloid, K = -n², f = R/(n - 1), its plane in front."""
-    index, radius = 1.5, -5.0
-    lens = lens_from_prescription(
+def hyperboloid(focal_length, thickness, semi_diameter):
+    """A stigmatic lens of index 1.5, its plane in front: K = -n², R = -f·(n - 1)."""
+    index = 1.5
+    back = {"type": "conic", "radius": -focal_length * (index - 1.0), "conic": -(index**2)}
+    return lens_from_prescription(
         {
             "name": "hyperboloid",
             "stop": 1,
             "wavelengths": [NM],
             "surfaces": {
-                1: {"type": "plane", "semi_diameter": 4.0, "thickness": 3.0, "material": index},
-                2: {
-                    "type": "conic",
-                    "radius": radius,
-                    "conic": -(index**2),
-                    "semi_diameter": 4.0,
-                    "material": "air",
+                1: {
+                    "type": "plane",
+                    "semi_diameter": semi_diameter,
+                    "thickness": thickness,
+                    "material": index,
                 },
+                2: {**back, "semi_diameter": semi_diameter, "material": "air"},
             },
-            "sensor": {"distance": 10.0, "diameter": 1.0},
+            "sensor": {"distance": focal_length, "diameter": 1.0},
         },
         dtype=torch.float64,
     )
+
+
+def test_a_collimated_beam_enters_the_fibre_that_matches_its_focus():
+    """w' = λ·f/(π·w)."""
+    lens = hyperboloid(10.0, 3.0, 4.0)
     beam = 0.5
     fibre = NM * 1e-6 * 10.0 / (math.pi * beam)
     found = coupling(lens, source=beam, fibre=fibre)
@@ -134,6 +139,17 @@ def test_a_collimated_beam_enters_the_fibre_that_matches_its_focus():
     # (2·2/(1 + 4))², but for the lens's departure from the sine condition.
     wider = coupling(lens, source=beam, fibre=2.0 * fibre)
     assert float(wider.coupling) == pytest.approx(0.64, abs=2e-3)
+
+
+@pytest.mark.parametrize(("beam", "printed"), [(2.0, 0.999955), (1.5, 0.924587)])
+def test_zemax_s_sample_couples_what_its_physical_optics_print(beam, printed):
+    """Its Fiber Coupling, 1 µm, a fibre of 8 µm; printed in a notebook of PyZDDE (2014)."""
+    lens = hyperboloid(50.0, 10.0, 8.0)
+    where = conditions(lens, fields=0, wavelengths=1000.0)
+    found = fibre_coupling(lens, where, beam, fibre=0.008)
+    # What they differ by is the lens's departure from the sine condition, half of the square of
+    # the beam's slope.
+    assert float(found.coupling) == pytest.approx(printed, abs=1.5e-3)
 
 
 def test_the_derivatives_are_those_of_differences():
