@@ -73,9 +73,9 @@ class PupilEdge:
     width: float
     wavelength: float
 
-    def beyond(self, distance: float) -> float:
+    def beyond(self, distance: float) -> Tensor:
         """Return the share of the light that is diffracted farther than a distance, mm."""
-        whole = float((self.density * self.lengths).sum().detach())
+        whole = (self.density * self.lengths).sum()
         return MM_PER_NM * self.wavelength * whole / (2.0 * math.pi**2 * distance)
 
 

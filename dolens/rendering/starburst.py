@@ -31,8 +31,8 @@ from dolens.sensor.pixels import Sensor
 logger = logging.getLogger(__name__)
 
 # Wavelength over the pupil's width: light is the edge's from so many on, and a wavefront's to so
-# many, in windows of at most so many pixels and samples a side.
-_NEAREST, _WINDOW, _WIDEST, _FINEST = 2.0, 4.0, 65, 2048
+# many, in windows of at most so many pixels a side, where a pixel is no wider than so many.
+_NEAREST, _WINDOW, _WIDEST, _COARSE = 2.0, 4.0, 65, 20.0
 # Samples across the pupil, for its flux.
 _SAMPLES = 256
 # Points where the edge's light lands on a sensor that reaches so many pixels from it, lest streaks
@@ -120,7 +120,8 @@ def starburst(
         logger.info("starburst: left out: no aperture makes the edge of the pupil")
         return None
     pitch = sensor.pixel_pitch
-    level = power * edge.beyond(1.5 * pitch) / GREY_LEVEL
+    share = float(edge.beyond(1.5 * pitch).detach())
+    level = power * share / GREY_LEVEL
     if level < 1.0:
         logger.info("starburst: left out: %.2g grey levels leave the pixels at the image", level)
         return None
@@ -130,21 +131,23 @@ def starburst(
         max(row, sensor.height - row) + 2.0, max(column, sensor.width - column) + 2.0
     )
     nearest = _NEAREST * fringe
-    share = band[0] / wavelength, band[1] / wavelength
+    waves = band[0] / wavelength, band[1] / wavelength
     count = _POINTS << max(0, math.ceil(math.log2(corner / _REACH)))
     farthest = max(corner * pitch, 4.0 * nearest)
-    found = diffracted_light(edge, nearest, farthest, count, share)
+    found = diffracted_light(edge, nearest, farthest, count, waves)
     rows, columns = sensor.pixels(*(found.points + front.centre).unbind(-1))
     lit = front.coverage >= 0.5
     spot = float(torch.where(lit, front.intercept.detach().norm(dim=-1), 0.0).amax())
     size = 2 * math.ceil((_WINDOW * fringe + spot) / pitch) + 3
     middle = round(row), round(column)
     colours = [band[0] + c * (band[1] - band[0]) for c in _COLOURS] if band[0] < band[1] else []
-    window = _window(system, sensor, point, colours or [wavelength], middle, size)
+    window = None
+    if size <= _WIDEST and pitch <= _COARSE * fringe:
+        window = _window(system, sensor, point, colours or [wavelength], middle, size)
     whole = found.light.sum() + edge.beyond(corner * pitch)
     logger.info(
         "starburst: %.3g of the light %s is diffracted; near the image %s",
-        float(edge.beyond(1.5 * pitch)),
+        share,
         "beyond the next pixel",
         f"{size}×{size} pixels by waves" if window is not None else "rays",
     )
@@ -188,8 +191,6 @@ def _window(
     """Return the light of pixels about the image by waves, (size, size); None where these do not
     serve.
     """
-    if size > _WIDEST:
-        return None
     at = torch.tensor([middle], dtype=torch.float64, device=system.device)
     centre = torch.stack(sensor.positions(at[:, 0], at[:, 1]), -1)
     points = ObjectPoints.at([point] * len(wavelengths))

@@ -49,7 +49,7 @@ def test_a_round_edge_sends_as_much_beyond_a_circle_as_airy_s_pattern():
     landed, light, *_ = diffracted_light(edge, 2.0 * FRINGE, 500.0 * FRINGE, 1 << 13, (1.0, 1.0))
     r = landed.norm(dim=-1)
     for rings in (4.0, 20.0, 100.0):
-        beyond = float(light[r > rings * FRINGE].sum()) + edge.beyond(500.0 * FRINGE)
+        beyond = float(light[r > rings * FRINGE].sum() + edge.beyond(500.0 * FRINGE))
         assert beyond == pytest.approx(2.0 / (math.pi**2 * rings), rel=2e-3)
     # Evenly to all sides.
     angle = torch.atan2(landed[:, 1], landed[:, 0])
@@ -113,8 +113,8 @@ def test_streaks_fall_off_with_the_square_of_the_distance():
 
 def test_a_hole_s_edge_diffracts_too():
     """The share beyond a radius goes with the edge's length over the area."""
-    whole = edge_of(RADIUS).beyond(1.0)
-    ring = edge_of(ClearAperture(Circle(RADIUS), Circle(0.5 * RADIUS))).beyond(1.0)
+    whole = float(edge_of(RADIUS).beyond(1.0))
+    ring = float(edge_of(ClearAperture(Circle(RADIUS), Circle(0.5 * RADIUS))).beyond(1.0))
     assert ring / whole == pytest.approx(1.5 / 0.75, rel=1e-3)
 
 

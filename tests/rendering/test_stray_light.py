@@ -146,6 +146,18 @@ def test_waves_near_the_light_meet_the_edge_s_light_farther_out(starry):
     )
 
 
+def test_where_pixels_are_wide_rays_serve_as_well_as_waves(starry, monkeypatch):
+    """Of a light between pixels of fifteen fringes; a twentieth of it leaves the brightest."""
+    lens = starry[0]
+    wide = ImagingSystem.of(lens.system(), PlanarScene((FAR,), (GREEN,)), Sensor(61, 61, 0.066))
+    given = (lens, wide, 0, [light(30.4, 29.7, 1e5)], 2000)
+    waves = light_on_sensor(*given)[0]
+    monkeypatch.setattr("dolens.rendering.starburst._COARSE", 0.0)
+    rays = light_on_sensor(*given)[0]
+    assert not torch.equal(waves, rays)
+    assert float((waves - rays).abs().sum() / rays.sum()) < 0.02
+
+
 def test_a_round_stop_s_halo_falls_off_with_the_cube_of_the_distance():
     """The mean of Airy's rings, λN/(π³r³), over all azimuths, and smooth from pixel to pixel."""
     lens, pitch = hyperbola(50.0, 3.125), 0.02
