@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dolens.kernels.operators import are_plain, is_eager
+from dolens.kernels.operators import is_eager
 from dolens.optics.autograd import is_transformed
 from dolens.optics.elements import (
     Axes,
@@ -41,28 +41,109 @@ class _Carry(torch.autograd.Function):
     """Rays are carried through a gradient by the CPU's kernel; first derivatives only."""
 
     @staticmethod
-    def forward(
-        ctx: Any, motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int
-    ) -> Tensor:
-        """Carry (7, N), and keep the end."""
-        end: Tensor = _kernels().carry(
-            motion.clone(), t, base, medium.coefficients, medium.squared, steps
-        )
-        ctx.save_for_backward(end, t, base)
-        ctx.medium, ctx.steps = medium, steps
+    def forward(motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int) -> Tensor:
+        """Carry (7, N)."""
+        given = (medium.coefficients, medium.squared, steps)
+        end: Tensor = _kernels().carry(motion.clone(), t, base, *given)
         return end
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keep both ends."""
+        motion, t, base, ctx.medium, ctx.steps = inputs
+        ctx.save_for_backward(motion, output, t, base)
+        ctx.save_for_forward(motion, output, t, base)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         """Take cotangents back to the beginning."""
-        end, t, base = ctx.saved_tensors
+        motion, end, t, base = ctx.saved_tensors
         medium = ctx.medium
+        if not is_eager([cotangent, motion, t, base]):
+            return _by_operations(motion, t, base, medium, ctx.steps, cotangent)
         of_motion, of_base = _kernels().carry_adjoint(
             *(end, cotangent.contiguous().clone(), t, base),
             *(medium.coefficients, medium.squared, ctx.steps),
         )
         return of_motion, None, of_base if base.numel() > 1 else of_base.sum(0, True), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, _: Any, of_base: Tensor | None, *__: Any) -> Any:
+        """Carry tangents along; t has none."""
+        motion, _, t, base = ctx.saved_tensors
+        of_base = torch.zeros_like(base) if of_base is None else of_base
+        return _CarryTangent.apply(motion, t, base, tangent, of_base, ctx.medium, ctx.steps)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        """Carry the rays of many lenses as those of one."""
+        *tensors, medium, steps = args
+        folded = _folded(info.batch_size, in_dims[:3], tensors)
+        return _unfolded(_Carry.apply(*folded, medium, steps), info.batch_size), 1
+
+
+class _CarryTangent(torch.autograd.Function):
+    """Tangents are carried along with rays by the CPU's kernel."""
+
+    @staticmethod
+    def forward(
+        motion: Tensor,
+        t: Tensor,
+        base: Tensor,
+        tangent: Tensor,
+        of_base: Tensor,
+        medium: Gradient,
+        steps: int,
+    ) -> Tensor:
+        """Carry (7, N)."""
+        given = (medium.coefficients, medium.squared, steps)
+        tangents = tangent.contiguous().clone(), t, base, of_base.contiguous()
+        found: Tensor = _kernels().carry_tangent(motion, *tangents, *given)
+        return found
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keep nothing."""
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        """Carry many tangents as those of as many rays."""
+        *tensors, medium, steps = args
+        folded = _folded(info.batch_size, in_dims[:5], tensors)
+        return _unfolded(_CarryTangent.apply(*folded, medium, steps), info.batch_size), 1
+
+
+def _by_operations(
+    motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int, cotangent: Tensor
+) -> tuple[Tensor | None, ...]:
+    """Return the cotangents of `_Carry` through PyTorch's operations, which all can follow."""
+    with torch.enable_grad():
+        motion, base = (part.detach().requires_grad_() for part in (motion, base))
+        begin = Motion(*motion.unbind())
+        end = torch.stack(carry(lambda *point: medium.bend(base, *point), begin, t, steps))
+        of_motion, of_base = torch.autograd.grad(end, (motion, base), cotangent)
+    return of_motion, None, of_base, None, None
+
+
+def _folded(size: int, dims: tuple[Any, ...], tensors: list[Tensor]) -> list[Tensor]:
+    """Return (7, B·N) and (B·N,) of tensors with or without a dimension of a batch of B."""
+    batches = [
+        tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        for tensor, dim in zip(tensors, dims, strict=True)
+    ]
+    rays = batches[1].shape[-1]
+    return [
+        # An expanded tensor stays one where its shape allows it, and a kernel reads memory.
+        part.movedim(0, 1).reshape(part.shape[1], -1).contiguous()
+        if part.ndim == 3
+        else part.expand(size, rays).reshape(-1).contiguous()
+        for part in batches
+    ]
+
+
+def _unfolded(tensor: Tensor, size: int) -> Tensor:
+    return tensor.reshape(len(tensor), size, -1)
 
 
 def _kernels() -> Any:
@@ -165,19 +246,14 @@ class Space:
 
     def _carried(self, motion: Motion, t: Tensor, steps: int) -> Motion:
         """Return rays that are carried on by t."""
-        searches = is_transformed() and not torch.is_grad_enabled() and are_plain((t, *motion))
-        if not self.kernels or not (searches or (t.numel() >= _FEW and is_eager([t]))):
+        if not self.kernels or not (is_transformed() or (t.numel() >= _FEW and is_eager([t]))):
             return carry(self.bend, motion, t, steps)
         base = torch.as_tensor(self.base, dtype=t.dtype, device=t.device)
         if base.numel() > 1:
             base = base.expand(t.shape)
         parts = torch.stack(torch.broadcast_tensors(*motion))
         given = (parts.reshape(7, -1), t.reshape(-1).contiguous(), base.reshape(-1).contiguous())
-        if searches:
-            medium = self.medium
-            end = _kernels().carry(*given, medium.coefficients, medium.squared, steps)
-        else:
-            end = _Carry.apply(*given, self.medium, steps)
+        end = _Carry.apply(*given, self.medium, steps)
         return Motion(*end.reshape(7, *t.shape))
 
     def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:

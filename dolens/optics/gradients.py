@@ -212,7 +212,6 @@ def _drifted(motion: Motion, d: Number) -> Motion:
     return Motion(x + d * tx, y + d * ty, z + d * tz, tx, ty, tz, path)
 
 
-@lru_cache(maxsize=1024)
 def steps_through(
     medium: Gradient, base: float, start: float, length: float, radius: float, dtype: torch.dtype
 ) -> int:
@@ -227,8 +226,16 @@ def steps_through(
         dtype: precision of the rays.
 
     The fastest change of direction per t over a grid of points, √|∂(½∇n²)/∂r|, times t along the
-    axis is the phase.
+    axis is the phase.  Two digits of the lengths count.
     """
+    lengths = (float(f"{number:.2g}") for number in (base, start, length, radius))
+    return _steps(medium, *lengths, dtype)
+
+
+@lru_cache(maxsize=1024)
+def _steps(
+    medium: Gradient, base: float, start: float, length: float, radius: float, dtype: torch.dtype
+) -> int:
     fastest, slowest = 0.0, math.inf
     step = 1e-4 * max(radius, abs(length), 1e-6)
     for i in range(_LOOKS):

@@ -20,7 +20,13 @@ from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import MapOfLenses
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
-from dolens.optics.ray_tracing import FlatRays, choose_backend, flat_rays, trace_rays
+from dolens.optics.ray_tracing import (
+    FlatRays,
+    choose_backend,
+    flat_rays,
+    trace_rays,
+    traced_by_operations,
+)
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.system import OpticalSystem
 
@@ -296,7 +302,7 @@ def reference_jacobian(
     def outputs_of(vector: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         parts = zip(parameters.items(), vector.split(sizes), strict=True)
         system = lens.system({name: part.reshape(p.shape) for (name, p), part in parts})
-        hit = trace_rays(system.traced_by("reference"), rays)
+        hit = trace_rays(traced_by_operations(system), rays)
         values = _select(hit, outputs)
         values = torch.where(hit.valid[..., None], values, torch.zeros_like(values))
         return values, (values.detach(), hit.valid)

@@ -21,7 +21,7 @@ from dolens.kernels.operators import kernels_of_lenses
 from dolens.kernels.table import IndexMap, MapOfLenses, SurfaceTable, VariableMap
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
-from dolens.optics.ray_tracing import choose_backend, trace_rays
+from dolens.optics.ray_tracing import choose_backend, trace_rays, traced_by_operations
 from dolens.optics.rays import Components, Rays, TracedRays, arrives
 
 
@@ -432,7 +432,7 @@ def traced_lens(lens: Lens, names: Sequence[str], values: Tensor, rays: Rays) ->
         rays: N of them.
     """
     system = lens.system(dict(zip(names, values.unbind(), strict=True)))
-    return trace_rays(system.traced_by("reference"), rays)
+    return trace_rays(traced_by_operations(system), rays)
 
 
 def trace_lenses(

@@ -340,6 +340,14 @@ def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) ->
     return system.traced_by(choose_backend(system, others=others))
 
 
+def traced_by_operations(system: OpticalSystem) -> OpticalSystem:
+    """Return a lens as `torch.func` can follow its trace: by the reference, whose kernel of
+    gradients it follows too.
+    """
+    follows = system.gradients and system.backend == "auto"
+    return system if follows else system.traced_by("reference")
+
+
 def cpu_kernels_serve(system: OpticalSystem, others: Iterable[Tensor] = ()) -> bool:
     """Return whether what is done with a lens's rays is done by the CPU's fused kernels too.
 

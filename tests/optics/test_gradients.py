@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad, solve_ivp
+from torch.func import jacfwd
 
 import dolens
 from dolens import InputError, Rays
@@ -298,7 +299,7 @@ def test_derivatives_with_respect_to_rays_and_wavelengths():
     def place(numbers):
         y, wavelength = numbers.unbind()
         position = start.position + torch.stack([0 * y, y, 0 * y])
-        hit = lens.trace(Rays(position, start.direction, wavelength))
+        hit = trace_rays(lens.system(), Rays(position, start.direction, wavelength))
         return torch.cat([hit.position[0, :2], hit.path_length])
 
     at = torch.tensor([0.1, 600.0], dtype=torch.float64)
@@ -306,6 +307,7 @@ def test_derivatives_with_respect_to_rays_and_wavelengths():
     steps = torch.diag(torch.tensor([1e-5, 1e-2], dtype=torch.float64))
     known = [(place(at + s) - place(at - s)) / (2.0 * s.sum()) for s in steps]
     close(found, torch.stack(known, -1).detach(), 1e-8)
+    close(jacfwd(place)(at), found, 1e-11)
 
 
 def test_rays_that_are_lost_are_finite_and_spoil_no_gradient():
@@ -342,6 +344,18 @@ def test_the_kernel_takes_the_same_steps_and_their_adjoint(monkeypatch, medium, 
     for eager, kernel in zip(*found, strict=True):
         scale = eager.abs().max()
         close((kernel - eager) / scale, 0.0 * eager, 2e-13 if dtype is torch.float64 else 3e-5)
+
+
+def test_a_batch_of_gradients_passes_the_kernel(monkeypatch):
+    monkeypatch.setattr(bent_rays, "_FEW", 1)
+    rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
+    lens = thick_lens()
+    value = lens.thicknesses["1"]
+    heights = trace_rays(lens.system(), rays).position[:, 1]
+    batch = torch.eye(3, dtype=torch.float64)
+    (found,) = torch.autograd.grad(heights, value, batch, is_grads_batched=True, retain_graph=True)
+    known = [torch.autograd.grad(height, value, retain_graph=True)[0] for height in heights]
+    close(found, torch.stack(known), 1e-13)
 
 
 def test_a_second_derivative_says_that_the_kernel_has_none(monkeypatch):

@@ -30,7 +30,7 @@ _BLOCK = 64
 # Coefficients of r², r⁴, ..., r¹²; z, ..., z⁴; x, x²; y, y².
 COEFFICIENTS = 14
 _PARTS = 7  # of a motion: position, optical direction, path
-# Rows of a block's memory: a motion, a step, the base; its cotangents, and the base's.
+# Rows of a block's memory: a motion, a step, the base; its tangents or cotangents, and the base's.
 _H, _BASE, _C, _OF_BASE = 7, 8, 9, 16
 _WORK = 17 * _BLOCK
 _INLINED = {**OPTIONS, "forceinline": True}
@@ -38,8 +38,8 @@ _STAGES = len(DRIFTS)
 
 
 @cache
-def _profile(real: types.Type) -> tuple[Any, Any]:
-    """Compile the profile's ½n² and ½∇n², and what the adjoint needs of it.
+def _profile(real: types.Type) -> tuple[Any, Any, Any]:
+    """Compile the profile's ½n² and ½∇n², and what derivatives need of it.
 
     Coefficients come as a tuple: in memory that is also written to they would be read at each ray.
     """
@@ -73,6 +73,26 @@ def _profile(real: types.Type) -> tuple[Any, Any]:
         return half * n * abs(n), n * gx, n * gy, n * gz
 
     @njit(**_INLINED)
+    def tangent(c, base, squared, x, y, z, a, b, d, e):  # noqa: ANN001, ANN202
+        """Return ½n² and ½∇n², and their tangents along (a, b, d) and e of the base."""
+        value, gx, gy, gz, slope, u = slopes(c, x, y, z)
+        bend = (((thirty * c[5] * u + twenty * c[4]) * u + twelve * c[3]) * u + six * c[2]) * u
+        across = four * (bend + two * c[1]) * (x * a + y * b)
+        hx = two * (slope + c[11]) * a + across * x
+        hy = two * (slope + c[13]) * b + across * y
+        hz = ((twelve * c[9] * z + six * c[8]) * z + two * c[7]) * d
+        along = gx * a + gy * b + gz * d
+        if squared:
+            phi, of_phi = half * (base * base + value), half * along + base * e
+            fx, fy, fz = half * gx, half * gy, half * gz
+            return phi, fx, fy, fz, of_phi, half * hx, half * hy, half * hz
+        n, s = base + value, along + e
+        return (
+            half * n * abs(n), n * gx, n * gy, n * gz, n * s, s * gx + n * hx, s * gy + n * hy,
+            s * gz + n * hz,
+        )  # fmt: skip
+
+    @njit(**_INLINED)
     def adjoint(c, base, squared, x, y, z, a, b, d, p):  # noqa: ANN001, ANN202
         """Return ½∇n², the cotangent of the position of ½∇n²·(a, b, d) + ½n²·p, and of the base."""
         value, gx, gy, gz, slope, u = slopes(c, x, y, z)
@@ -94,18 +114,18 @@ def _profile(real: types.Type) -> tuple[Any, Any]:
             gz * along + n * hz + p * fz, along + p * n,
         )  # fmt: skip
 
-    return force, adjoint
+    return force, tangent, adjoint
 
 
 @cache
-def _stages(real: types.Type) -> tuple[Any, Any, Any]:
-    """Compile a drift and a kick of a block of rays, their adjoint, and how a block is filled.
+def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
+    """Compile how a block of rays is filled, a drift and a kick, their tangents and their adjoint.
 
     Rows of a block follow each other at a distance that is known, so that several rays are taken at
     a time.
     """
     at = real_at(real)
-    force, adjoint = _profile(real)
+    force, tangent, adjoint = _profile(real)
     half, zero = real(0.5), real(0.0)
 
     @njit(**OPTIONS)
@@ -133,6 +153,30 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any]:
             w[5 * _BLOCK + i], w[6 * _BLOCK + i] = k + d * fz, path + d * phi
 
     @njit(**OPTIONS)
+    def along(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
+        w = carray(block, _WORK)
+        for i in range(_BLOCK):
+            h, base, e = w[_H * _BLOCK + i], w[_BASE * _BLOCK + i], w[_OF_BASE * _BLOCK + i]
+            u, v, k = w[3 * _BLOCK + i], w[4 * _BLOCK + i], w[5 * _BLOCK + i]
+            du, dv = w[(_C + 3) * _BLOCK + i], w[(_C + 4) * _BLOCK + i]
+            dk = w[(_C + 5) * _BLOCK + i]
+            d = drift * h
+            x, y, z = w[i] + d * u, w[_BLOCK + i] + d * v, w[2 * _BLOCK + i] + d * k
+            a, b = w[_C * _BLOCK + i] + d * du, w[(_C + 1) * _BLOCK + i] + d * dv
+            s = w[(_C + 2) * _BLOCK + i] + d * dk
+            phi, fx, fy, fz, of_phi, gx, gy, gz = tangent(c, base, squared, x, y, z, a, b, s, e)
+            path = w[6 * _BLOCK + i] + half * d * (u * u + v * v + k * k)
+            of_path = w[(_C + 6) * _BLOCK + i] + d * (u * du + v * dv + k * dk)
+            d = kick * h
+            w[i], w[_BLOCK + i], w[2 * _BLOCK + i] = x, y, z
+            w[3 * _BLOCK + i], w[4 * _BLOCK + i] = u + d * fx, v + d * fy
+            w[5 * _BLOCK + i], w[6 * _BLOCK + i] = k + d * fz, path + d * phi
+            w[_C * _BLOCK + i], w[(_C + 1) * _BLOCK + i] = a, b
+            w[(_C + 2) * _BLOCK + i], w[(_C + 3) * _BLOCK + i] = s, du + d * gx
+            w[(_C + 4) * _BLOCK + i], w[(_C + 5) * _BLOCK + i] = dv + d * gy, dk + d * gz
+            w[(_C + 6) * _BLOCK + i] = of_path + d * of_phi
+
+    @njit(**OPTIONS)
     def backwards(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
         w = carray(block, _WORK)
         for i in range(_BLOCK):
@@ -157,13 +201,13 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any]:
             w[(_C + 4) * _BLOCK + i] = b + d * (ry + p * v)
             w[(_C + 5) * _BLOCK + i] = e + d * (rz + p * s)
 
-    return fill, onwards, backwards
+    return fill, onwards, along, backwards
 
 
 def carry_driver(real: types.Type) -> Callable[..., None]:
     """Compile the driver that carries blocks `first` to `end` of rays through all steps."""
     at = real_at(real)
-    fill, onwards, _ = _stages(real)
+    fill, onwards, _, _ = _stages(real)
     kicks = tuple(real(kick) for kick in KICKS)
     drifts = tuple(real(drift) for drift in DRIFTS)
     double, zero = real(2.0) * kicks[0], real(0.0)
@@ -200,10 +244,53 @@ def carry_driver(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
+def carry_tangent_driver(real: types.Type) -> Callable[..., None]:
+    """Compile the driver that carries tangents of blocks of rays along with them to their ends."""
+    at = real_at(real)
+    fill, _, along, _ = _stages(real)
+    kicks = tuple(real(kick) for kick in KICKS)
+    drifts = tuple(real(drift) for drift in DRIFTS)
+    double, zero = real(2.0) * kicks[0], real(0.0)
+
+    def kernel(job_, first, end):  # noqa: ANN001, ANN202
+        job = carray(job_, _JOB)
+        count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
+        tangents = carray(at(job[COTANGENT]), UNBOUNDED)
+        of_bases = carray(at(job[OF_BASE]), UNBOUNDED)
+        times, bases = carray(at(job[TIME]), UNBOUNDED), carray(at(job[BASE]), UNBOUNDED)
+        n = carray(at(job[PROFILE]), COEFFICIENTS)
+        c = (
+            n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
+        )  # fmt: skip
+        block = at(job[WORK])
+        w = carray(block, _WORK)
+        for number in range(first, end):
+            begin = number * _BLOCK
+            fill(job, block, job[MOTION], count, begin)
+            fill(job, shifted(block, _C * _BLOCK), job[COTANGENT], count, begin)
+            for i in range(_BLOCK):
+                ray = min(begin + i, count - 1)
+                w[_H * _BLOCK + i] = times[ray] / real(steps)
+                w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
+                w[_OF_BASE * _BLOCK + i] = of_bases[ray * job[BASE_STEP]]
+            along(block, c, squared, zero, kicks[0])
+            for step in range(steps):
+                for stage in range(_STAGES):
+                    kick = kicks[stage + 1]
+                    if stage == _STAGES - 1 and step < steps - 1:
+                        kick = double
+                    along(block, c, squared, drifts[stage], kick)
+            for row in range(_PARTS):
+                for i in range(min(_BLOCK, count - begin)):
+                    tangents[row * count + begin + i] = w[(_C + row) * _BLOCK + i]
+
+    return kernel
+
+
 def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
     """Compile the driver that takes cotangents of blocks of rays back to their beginnings."""
     at = real_at(real)
-    fill, _, backwards = _stages(real)
+    fill, _, _, backwards = _stages(real)
     kicks = tuple(real(kick) for kick in KICKS)
     drifts = tuple(real(drift) for drift in DRIFTS)
     double, zero = real(2.0) * kicks[0], real(0.0)
@@ -269,6 +356,31 @@ def carry(
     _run(carry_driver, job, motion)
     del kept
     return motion
+
+
+def carry_tangent(
+    motion: Tensor,
+    tangent: Tensor,
+    time: Tensor,
+    base: Tensor,
+    of_base: Tensor,
+    profile: tuple[float, ...],
+    squared: bool,
+    steps: int,
+) -> Tensor:
+    """Return the tangents (7, N) of the end from those of the beginning.
+
+    Args:
+        motion: (7, N), the beginning.
+        tangent: (7, N), of it; it is overwritten.
+        time: as of `carry`, and what follows.
+        of_base: tangent of the base, of its shape.
+    """
+    job, kept = _job(motion, time, base, profile, squared, steps)
+    job[COTANGENT], job[OF_BASE] = tangent.data_ptr(), of_base.data_ptr()
+    _run(carry_tangent_driver, job, motion)
+    del kept
+    return tangent
 
 
 def carry_adjoint(
