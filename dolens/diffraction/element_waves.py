@@ -350,14 +350,12 @@ class ElementLight:
         # Of a pixel that is one cell, the part that its height fills turns light further.
         whole = relief.pixelated and plan.cell > 0.99 * relief.pitch and relief.fill < 1.0
         share = on_grid(filled, x, y, dtype) if whole else None
-        passed = transmission(
-            relief, x, y, on_grid(path, x, y, dtype), (front, after), phase, share
-        )
         if relief.pixelated:
             amplitude = amplitude * on_grid(turned, x, y, dtype)
-        angle = (2.0 * math.pi) * (turns - turns.detach().round()).to(dtype)
-        values = torch.polar(amplitude.to(dtype), angle)
-        return values * passed.to(values.dtype), x, y
+        length = on_grid(path, x, y, dtype)
+        turns = (turns - turns.detach().round()).to(dtype)
+        passed = transmission(relief, x, y, length, (front, after), phase, share, turns)
+        return passed.to(dtype.to_complex()) * amplitude.to(dtype), x, y
 
     def _pupil(
         self, n: int, plan: "Plan", carrier: tuple[float, float], dtype: torch.dtype

@@ -157,6 +157,7 @@ def transmission(
     media: tuple[Medium, Medium],
     phase: PhaseOnGrid | None = None,
     filled: Tensor | None = None,
+    incident: Tensor | None = None,
 ) -> Tensor:
     """Return the complex transmission (Y, X) of a relief on the cells of a regular grid.
 
@@ -172,10 +173,12 @@ def transmission(
         phase: of the surface, where it has one.
         filled: (Y, X), part of a cell's amplitude that stands at its pixel's height, which depends
             on where light goes; None: that part of its area.
+        incident: (Y, X), turns of the light that arrives, which what is returned then has as well;
+            so there is one phasor to compute.
     """
     cell = float((x[-1] - x[0]) / max(1, len(x) - 1))
     period = relief.period(1 if phase is None else phase.order, *media)
-    turns_of = _Turns(relief, period, path, as_made=phase is not None and relief.levels is None)
+    turns_of = _Turns(relief, period, path, incident, phase is not None and relief.levels is None)
     if phase is not None:
         height, share, beyond = _blazed(relief, phase, media, cell)
     elif relief.heights is not None and not relief.pixelated:
@@ -192,7 +195,8 @@ def transmission(
         rows, columns = relief.heights.shape
         down, across = _filled(relief, y, cell, rows), _filled(relief, x, cell, columns)
         filled = down[:, None] * across if filled is None else filled
-        turned = 1.0 + filled * (turned - 1.0)
+        flat = 1.0 if incident is None else _phasor(incident)
+        turned = flat + filled * (turned - flat)
     return turned
 
 
@@ -203,13 +207,15 @@ class _Turns:
     relief: Relief
     period: float | None
     path: Tensor | float
+    incident: Tensor | None
     as_made: bool
 
     def __call__(self, height: Tensor) -> Tensor:
         made = height * self.relief.etch_scale
         if not self.as_made:
             made = self.relief.made(height, self.period)
-        return _phasor(made * self.path)
+        turns = made * self.path
+        return _phasor(turns if self.incident is None else turns + self.incident)
 
 
 def _blazed(
