@@ -26,7 +26,6 @@ PITCH, FOCAL, DESIGN = 0.002, 8.0, 550.0
 WAVES = (450.0, 550.0, 650.0)
 FIELDS = [(x, y) for x in (0.0, 1.5, 3.0) for y in (0.0, 1.5, 3.0)]
 SIZE, POINTS, PARTS = 64, 6, 6
-THREADS = 2
 # dolens with gradients with respect to all of the lens, where time is measured.
 WHOLE = "dolens_whole_lens"
 
@@ -59,7 +58,7 @@ def places(angle: float) -> tuple[np.ndarray, float]:
     return (np.arange(POINTS) + 0.5 - 0.5 * POINTS) * PITCH, middle
 
 
-def reference(count: int, angle: float) -> np.ndarray:
+def reference(angle: float, count: int) -> np.ndarray:
     """Return the irradiance at the points, of unit sum."""
     u, middle = places(angle)
     side = count * PARTS
@@ -178,9 +177,9 @@ def deeplens_seconds(count: int) -> dict[str, float]:
     return clock.numbers
 
 
-def child(program: str, what: str, count: int) -> None:
+def child(program: str, what: str, count: int, threads: int) -> None:
     """Measure one thing in this process, and print it as JSON."""
-    torch.set_num_threads(THREADS)
+    torch.set_num_threads(threads)
     found: dict[str, Any] = {}
     if what == "seconds":
         if program == "deeplens":
@@ -194,11 +193,11 @@ def child(program: str, what: str, count: int) -> None:
     print(json.dumps(found))
 
 
-def run(program: str, what: str, count: int, path: str | None) -> dict[str, Any]:
+def run(program: str, what: str, count: int, path: str | None, threads: int) -> dict[str, Any]:
     """Run one measurement in a process of its own."""
-    command = [sys.executable, "-P", __file__, "--child", program, what, str(count)]
+    command = [sys.executable, "-P", __file__, "--child", program, what, str(count), str(threads)]
     paths = [p for p in (path, os.environ.get("PYTHONPATH")) if p]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     if done.returncode:
         return {"error": done.stderr.strip().splitlines()[-1]}
@@ -212,16 +211,17 @@ def main() -> None:
     parser.add_argument("--deeplens", help="directory that holds the package deeplens")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--count", type=int, default=1024, help="pixels a side, for times")
-    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        child(given.child[0], given.child[1], int(given.child[2]))
+        child(*given.child[:2], *map(int, given.child[2:]))
         return
     programs = ["dolens", *(["deeplens"] if given.deeplens else [])]
-    exact = run("reference", "error", 512, None)
+    exact = run("reference", "error", 512, None, given.threads)
     print("largest error over the peak, 512 pixels a side, on the axis and at 2 degrees:")
     for program in programs:
-        found = run(program, "error", 512, given.deeplens)
+        found = run(program, "error", 512, given.deeplens, given.threads)
         if "error" in found:
             print(f"  {program}: {found['error']}")
             continue
@@ -238,7 +238,8 @@ def main() -> None:
     times: dict[str, list[dict[str, Any]]] = {program: [] for program in programs}
     for _ in range(given.repeats):
         for program in programs:
-            times[program].append(run(program, "seconds", given.count, given.deeplens))
+            found = run(program, "seconds", given.count, given.deeplens, given.threads)
+            times[program].append(found)
             print(f"  {program}: {times[program][-1]}", flush=True)
     for program, rows in times.items():
         good = [row for row in rows if "seconds" in row]
