@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from dolens.errors import InputError
 from dolens.kernels.table import DRIFTS, KICKS
 from dolens.optics.autograd import is_transformed
 
@@ -252,6 +253,8 @@ def _steps(
                     fastest = max(fastest, change / step)
     phase = math.sqrt(fastest) * (abs(length) + 0.5 * radius) / max(math.sqrt(slowest), 0.3)
     rate, least = _STEPS.get(dtype, _STEPS[torch.float64])
+    if not math.isfinite(phase):
+        return _MOST_STEPS
     return max(least, min(_MOST_STEPS, math.ceil(rate * phase)))
 
 
@@ -300,10 +303,19 @@ def bent_gap(
         start: z of the gap's beginning from the vertex that the profile counts from, mm.
         thickness: with its sign, mm.
         meridian: section `x` or `y`; None: the mean.
+
+    Raises:
+        InputError: the index is not positive there.
     """
 
     def index(z: Number) -> Number:
-        return medium.bend(base, 0.0, 0.0, z).squared ** 0.5
+        squared = medium.bend(base, 0.0, 0.0, z).squared
+        if not plain(squared) > 0.0:
+            raise InputError(
+                f"material '{medium.name}': its index is not positive on the axis at "
+                f"{plain(z):g} mm"
+            )
+        return squared**0.5
 
     way = -1.0 if plain(thickness) < 0.0 else 1.0
     curvature = medium.curvature(meridian)
@@ -320,7 +332,7 @@ def bent_gap(
 
     def bend(y: Number, y2: Number, z: Number) -> Bend:
         here = medium.bend(base, 0.0, 0.0, z)
-        kappa = curvature if medium.squared else 2.0 * here.squared**0.5 * curvature
+        kappa = curvature if medium.squared else 2.0 * abs(here.squared) ** 0.5 * curvature
         return Bend(0.0, kappa * y, kappa * y2, here.z)
 
     begin = Motion(1.0, 0.0, start, 0.0, 1.0, way * index(start), 0.0)

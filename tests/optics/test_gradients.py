@@ -456,6 +456,15 @@ def test_a_medium_that_cannot_be_meant_is_refused(material, message):
     assert "surface 1" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_profile_beyond_all_numbers_loses_rays_and_an_index_below_zero_is_refused(monkeypatch):
+    monkeypatch.setattr("dolens.optics.gradients._MOST_STEPS", 64)
+    lens = lens_of("gradient 1.5 r12=1e300", 0.01)
+    hit = lens.trace(beam((0.0, 1.0), (0.0, 0.0)))
+    assert hit.valid.tolist() == [False, True] and bool(hit.position.isfinite().all())
+    with pytest.raises(InputError, match="its index is not positive on the axis at"):
+        lens_of("gradient 1.5 z=-1", 4.0).first_order(550.0)
+
+
 def test_what_does_not_hold_in_a_gradient_is_refused_by_name(tmp_path):
     lens = thick_lens(distance=10.0)
     views = {
