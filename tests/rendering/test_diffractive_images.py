@@ -6,6 +6,7 @@ import torch
 from dolens.errors import InputError
 from dolens.optics.diffractive import lens_phase
 from dolens.prescriptions.build import lens_from_prescription
+from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -64,3 +65,16 @@ def test_rays_do_not_show_heights_alone():
     surface.phase = None
     with pytest.raises(InputError, match="heights alone, which rays do not see"):
         RayRenderer(SENSOR, 4).render(lens, SCENE, texture(), 0)
+
+
+def test_auto_asks_waves_whether_the_order_of_rays_is_enough():
+    plans = {}
+    for levels, sensor in ((2, SENSOR), (None, Sensor(64, 64, 0.03))):
+        element = {} if levels is None else {"levels": levels}
+        renderer = AutoRenderer(sensor, tolerance=4.0)
+        renderer.prepare(flat_lens(torch.float32, **element), SCENE)
+        plans[levels] = renderer.choice
+    assert plans[2].renderer.diffraction == "wave"
+    assert any("other orders than rays'" in line for line in plans[2].lines())
+    # A blazed relief at its wavelength, and pixels far larger than the Airy disc.
+    assert plans[None].renderer.settings().get("diffraction", "none") == "none"
