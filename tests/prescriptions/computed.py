@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.analysis.conditions import conditions, full_field
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
+from dolens.optics.diffractive import transmission
 from dolens.optics.fields import vignetting_margin
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
@@ -33,8 +34,8 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     """Yield what a lens computes, the cheap numbers first; a state of it after the other.
 
     They are: fixed rays through the lens at each of its wavelengths, with their path lengths and
-    validity; what its coatings reflect and pass; margins of its clear apertures, and how large its
-    surfaces are drawn; first-order numbers; the same rays through the heated lens; sags; vignetting
+    validity; what its coatings reflect and pass; what reliefs of its diffractive elements pass;
+    margins of its clear apertures, and how large its surfaces are drawn; first-order numbers; the same rays through the heated lens; sags; vignetting
     and paraxial chief rays of its own fields; their spots and real chief rays, with the means over
     wavelengths and fields that their weights make; its full field.
     """
@@ -42,6 +43,7 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     for compute in (
         _rays,
         _coatings,
+        _reliefs,
         _apertures,
         _first_order,
         _hot_rays,
@@ -104,6 +106,18 @@ def _coatings(lens: Lens) -> list[Tensor]:
     coatings = [state.coating for state in lens.system().surfaces if state.coating is not None]
     found = [part for c in coatings for part in c.shares(1.1, 1.6, cosines, waves)]
     return found or [torch.zeros(0)]
+
+
+def _reliefs(lens: Lens) -> list[Tensor]:
+    system, at = lens.system(), torch.linspace(-0.7, 0.7, 31, dtype=torch.float64)
+    found = [torch.zeros(0)]
+    for number in system.diffractive:
+        relief = system.surfaces[number - 1].relief
+        media = system.materials[number - 1], system.materials[number]
+        for wave in (500.0, 600.0):
+            passed = transmission(relief, at, at, relief.step(*media, wave) / wave, media)
+            found.append(torch.view_as_real(passed))
+    return found
 
 
 def _apertures(lens: Lens) -> list[Tensor]:
