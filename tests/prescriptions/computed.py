@@ -34,10 +34,11 @@ def fingerprint(lens: Lens) -> Iterator[Tensor]:
     """Yield what a lens computes, the cheap numbers first; a state of it after the other.
 
     They are: fixed rays through the lens at each of its wavelengths, with their path lengths and
-    validity; what its coatings reflect and pass; what reliefs of its diffractive elements pass;
-    margins of its clear apertures, and how large its surfaces are drawn; first-order numbers; the same rays through the heated lens; sags; vignetting
-    and paraxial chief rays of its own fields; their spots and real chief rays, with the means over
-    wavelengths and fields that their weights make; its full field.
+    validity; what its coatings reflect and pass, and what reliefs of diffractive elements pass;
+    margins of its clear apertures, and how large its surfaces are drawn; first-order numbers; the
+    same rays through the heated lens; sags; vignetting and paraxial chief rays of its own fields;
+    their spots and real chief rays, with the means over wavelengths and fields that their weights
+    make; its full field.
     """
     there = [lens, *(lens.in_state(name) for name in lens.state_names)]
     for compute in (
