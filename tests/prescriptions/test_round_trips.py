@@ -30,6 +30,9 @@ REFUSED = {
     ("freeform_corrector", ".zmx"): "surface 2: a .zmx file cannot hold type 'b_spline'",
     ("freeform_corrector", ".txt"): "surface 2: a .txt file cannot hold type 'b_spline'",
     ("freeform_corrector", ".seq"): "surface 2: a .seq file cannot hold type 'b_spline'",
+    ("diffractive_doublet", ".zmx"): "surface 5: a .zmx file cannot hold 'diffractive'",
+    ("diffractive_doublet", ".txt"): "surface 5: a .txt file cannot hold 'phase'",
+    ("diffractive_doublet", ".seq"): "surface 5: a .seq file cannot hold 'phase'",
     # Plastics are no glass of a maker that these formats know.
     **{
         (name, suffix): f"surface 2: a {suffix} file cannot hold material 'PLASTIC:ZEONEX-E48R'"
