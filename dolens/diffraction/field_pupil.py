@@ -7,6 +7,7 @@ that miss a surface, rays alone make the image; `reason` says which.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -351,19 +352,26 @@ def transfer_functions(
     return found, perfect
 
 
-def fast_length(count: int) -> int:
-    """Return the smallest number, from a count on, whose prime factors are 11 or less.
+def fast_length(count: int, primes: Sequence[int] = (2, 3, 5, 7, 11), even: bool = False) -> int:
+    """Return the smallest number, from a count on, that has no prime factors but these.
 
     It is SciPy's `next_fast_len`, whose import takes longer than the transforms of a lens.
+
+    Args:
+        count: one or more.
+        primes: the factors that may be.
+        even: whether the number must be even.
     """
+    step = 2 if even else 1
+    count += count % step
     while True:
         left = count
-        for prime in (2, 3, 5, 7, 11):
+        for prime in primes:
             while left % prime == 0:
                 left //= prime
         if left == 1:
             return count
-        count += 1
+        count += step
 
 
 def _line_spreads(pupil: RegularPupil, axis: int, size: int) -> Tensor:

@@ -27,6 +27,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.diffraction.field_pupil import fast_length
+from dolens.diffraction.propagation import phasor
 from dolens.diffraction.wavefront import MM_PER_NM
 from dolens.errors import InputError
 
@@ -43,6 +45,8 @@ _COARSE = 65
 # What a band of a few frequencies is taken wider by, which is cut smoothly anyway.
 _WIDER = 1.5
 _CHUNK = 1 << 20
+# Factors of the lengths of transforms.
+_PRIMES = 2, 3, 5
 
 
 @dataclass(frozen=True)
@@ -118,12 +122,12 @@ def by_spectrum(
         ways.append(axis.step * (start + torch.arange(min(count, axis.padded)).to(field.x)))
     for axis, frequency, dim in zip(axes, ways, (1, 0), strict=True):
         steps = torch.arange(axis.cells).to(field.x) * cell
-        shifted = values * _turned(-steps * frequency[0], values).unsqueeze(1 - dim)
+        shifted = values * phasor(-steps * frequency[0], values.real.dtype).unsqueeze(1 - dim)
         values = torch.fft.fft(shifted, n=axis.padded, dim=dim).narrow(dim, 0, len(frequency))
     true = ways[0] + axes[0].tilt, ways[1] + axes[1].tilt
     values = values * _free_space(true, axes, layers, wave, values)
     e_u, e_v = (
-        _turned((w[:, None] + axis.away + axis.half) * f, values) / axis.padded
+        phasor((w[:, None] + axis.away + axis.half) * f, values.real.dtype) / axis.padded
         for w, f, axis in zip((u, v), ways, axes, strict=True)
     )
     return _product(e_v, values, e_u)
@@ -161,7 +165,7 @@ class _Axis:
         edge = max(_FEWEST_EDGE * cell, _EDGE * zone)
         straight = 0.5 * cell * cells + half_window
         inner = straight + _SPREAD * zone
-        padded = fast_length(math.ceil((straight + inner + edge) / cell))
+        padded = fast_length(math.ceil((straight + inner + edge) / cell), _PRIMES, even=True)
         away, half = middle - 0.5 * float(at[0] + at[-1]), 0.5 * float(at[-1] - at[0])
         step = 1.0 / (padded * cell)
         return _Axis(cells, padded, step, tilt, away, half, inner, padded * cell - straight)
@@ -220,7 +224,7 @@ def _free_space(
         if not smooth:
             square = true[0].square()[None] + true[1].square()[:, None]
             gain = gain * (square < lowest * lowest)
-    return _phasor(phase, gain, like)
+    return phasor(phase, like.real.dtype, gain)
 
 
 def on_grid(
@@ -323,10 +327,10 @@ def by_fourier(
     turns, distance = to_centre(field.x, field.y, layer, centre, field.wavelength, field.carrier)
     gain = field.pitch**2 / wave * layer.thickness / distance.square()
     values = field.values
-    values = values * (gain.to(values.real) if focused else _phasor(turns, gain, values))
+    values = values * (gain.to(values.real) if focused else phasor(turns, values.real.dtype, gain))
     scales, starts = _linear(field.x, field.y, layer.thickness, centre)
     e_u, e_v = (
-        _turned(-w[:, None] * ((at - start) * scale / wave), values)
+        phasor(-w[:, None] * ((at - start) * scale / wave), values.real.dtype)
         for w, at, start, scale in zip((u, v), (field.x, field.y), starts, scales, strict=True)
     )
     return _product(e_v, values, e_u)
@@ -436,33 +440,8 @@ def by_summation(
         turns = square / (r + z) / wave + tilt
         near = 1.0 / (2.0 * math.pi * r)
         kernel = torch.complex(near, torch.full_like(near, -1.0 / wave)) * (z / (r * r))
-        found.append((kernel * _phasor(turns, torch.ones_like(r), source)) @ source)
+        found.append((kernel * phasor(turns, source.real.dtype)) @ source)
     return torch.cat(found) * field.pitch**2
-
-
-def fast_length(least: int) -> int:
-    """Return the next length whose Fourier transform is fast: a product of 2, 3 and 5, and even."""
-    length = least + least % 2
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 2
-
-
-def _phasor(turns: Tensor, modulus: Tensor, like: Tensor) -> Tensor:
-    """Return modulus·exp(2πi·turns) in the precision of `like`, reduced to one turn before."""
-    real = like.real.dtype
-    angle = (2.0 * math.pi) * (turns - turns.detach().round()).to(real)
-    return torch.polar(modulus.to(angle).expand_as(angle), angle)
-
-
-def _turned(turns: Tensor, like: Tensor) -> Tensor:
-    """Return exp(2πi·turns) in the precision of `like`."""
-    return _phasor(turns, torch.ones((), dtype=torch.float64, device=turns.device), like)
 
 
 def require_layers(layers: Sequence[Layer]) -> None:

@@ -308,11 +308,11 @@ def fourier_field(
     cell = (pupil.cosines[..., 1] - pupil.cosines[..., 0]).prod(-1)
     cycles = (pupil.index / wavelength)[:, None, None] * centred
     along_x, along_y = (
-        _phasor(rho[:, None].to(cycles) * cycles[:, axis, None], dtype)
+        phasor(rho[:, None].to(cycles) * cycles[:, axis, None], dtype)
         for axis, rho in enumerate((x, y))
     )
     scale = (cell * pupil.index / wavelength)[:, None, None]
-    function = _phasor(pupil.opd / wavelength[:, None, None], dtype, scale * pupil.amplitude)
+    function = phasor(pupil.opd / wavelength[:, None, None], dtype, scale * pupil.amplitude)
     if x.numel() < y.numel():
         return along_y @ (function @ along_x.mT)
     return (along_y @ function) @ along_x.mT
@@ -382,11 +382,11 @@ def wavelets(
     along = torch.stack((x, y), -1) @ direction.mT
     beyond, ratio = path_beyond(along, (x * x + y * y)[:, None], curvature)
     turns = (opd + index * beyond) / wavelength
-    return _phasor(turns, dtype, weight / ratio)
+    return phasor(turns, dtype, weight / ratio)
 
 
-def _phasor(turns: Tensor, dtype: torch.dtype, modulus: Tensor | None = None) -> Tensor:
-    """modulus·exp(2πi·turns), the phase reduced to one turn before its precision is."""
+def phasor(turns: Tensor, dtype: torch.dtype, modulus: Tensor | None = None) -> Tensor:
+    """Return modulus·exp(2πi·turns), the phase reduced to one turn before its precision is."""
     phase = (2.0 * torch.pi) * (turns - turns.detach().round()).to(dtype)
-    modulus = torch.ones_like(phase) if modulus is None else modulus.to(dtype)
+    modulus = torch.ones_like(phase) if modulus is None else modulus.to(phase).expand_as(phase)
     return torch.polar(modulus, phase)

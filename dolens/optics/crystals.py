@@ -18,6 +18,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -40,18 +41,36 @@ class Uniaxial:
     """A uniaxial crystal, and which of its two rays is followed.
 
     Attributes:
-        name: as a prescription writes it, see `materials.parse_material`.
         ordinary: the medium whose index is n_o.
         extraordinary: the medium whose index is n_e.
-        axis: the optic axis, a unit vector, in the axes of the surface in front of the crystal.
+        direction: along the optic axis, of any length, in the axes of the surface in front of the
+            crystal.
         ray: `ordinary` or `extraordinary`.
+
+    Raises:
+        ValueError: the direction has no length, or none that is finite.
     """
 
-    name: str
     ordinary: Any
     extraordinary: Any
-    axis: tuple[float, float, float]
+    direction: tuple[float, float, float]
     ray: str
+
+    def __post_init__(self) -> None:
+        unit_axis(self.direction)
+
+    @property
+    def name(self) -> str:
+        """Return it as a prescription writes it, see `materials.parse_material`."""
+        media = self.ordinary.name
+        if self.extraordinary.name != f"{media}-E":
+            media = f"{media} and {self.extraordinary.name}"
+        return " ".join([media, self.ray, *(repr(c).removesuffix(".0") for c in self.direction)])
+
+    @cached_property
+    def axis(self) -> tuple[float, float, float]:
+        """Return the optic axis, a unit vector."""
+        return unit_axis(self.direction)
 
     @property
     def anisotropic(self) -> bool:
@@ -71,9 +90,7 @@ class Uniaxial:
 
     def following(self, ray: str) -> "Uniaxial":
         """Return the crystal in which the other ray is followed, or this one."""
-        axis = self.name.split()[-3:]
-        media = self.name.rsplit(None, 4)[0]
-        return replace(self, ray=ray, name=" ".join([media, ray, *axis]))
+        return replace(self, ray=ray)
 
     def index(self, wavelength: float | Tensor) -> Number:
         """Return the index that first-order optics takes at a wavelength in nm; the mean over

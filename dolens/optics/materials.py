@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeGuard
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, comma_hint, did_you_mean
-from dolens.optics.crystals import RAYS, Uniaxial, unit_axis
+from dolens.optics.crystals import RAYS, Uniaxial
 from dolens.optics.dispersion import ModelGlass, model_glass, require_wavelength
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.glass_catalog import find_glass
@@ -247,29 +247,22 @@ def abbe_number(medium: Medium) -> float:
 
 
 def _crystal(found: re.Match[str], model: IndexModel, environment: Environment | None) -> Uniaxial:
-    text, ray, components = found[0], found["ray"].lower(), found["axis"].split()
+    text, ray = found[0], found["ray"].lower()
     first, both, second = found["medium"].partition(" and ")
-    try:
-        x, y, z = map(float, components)
-        axis = unit_axis((x, y, z))
-    except ValueError:
-        raise InputError(
-            f"material '{text}': behind '{ray}' stand the three numbers of the optic axis, which "
-            "are not all zero"
-        ) from None
-    media: list[Medium] = []
     if not both:
         # Catalogues that have the one ray alone are passed over.
         second = f"{first}-E"
         maker, _, _ = _part_of(text, second, model, environment).name.rpartition(":")
         first = f"{maker}:{first}" if maker and ":" not in first else first
-    for part in (first, second):
-        media.append(_part_of(text, part, model, environment))
-    ordinary, extraordinary = media
-    name = ordinary.name
-    if extraordinary.name != f"{name}-E":
-        name = f"{name} and {extraordinary.name}"
-    return Uniaxial(f"{name} {ray} {' '.join(components)}", ordinary, extraordinary, axis, ray)
+    media = [_part_of(text, part, model, environment) for part in (first, second)]
+    try:
+        x, y, z = map(float, found["axis"].split())
+        return Uniaxial(media[0], media[1], (x, y, z), ray)
+    except ValueError:
+        raise InputError(
+            f"material '{text}': behind '{ray}' stand the three numbers of the optic axis, which "
+            "are not all zero"
+        ) from None
 
 
 def _part_of(

@@ -150,12 +150,16 @@ class OpticalSystem:
         """Return the places of gradient-index media, from 0 before surface 1, and the numbers of
         the surfaces that their profiles count from.
         """
-        found: dict[int, int] = {}
-        for place, medium in enumerate(self.materials):
-            if isinstance(medium, Gradient):
-                within = place in self.mirrors or place in self.breaks
-                found[place] = found[place - 1] if within else place
-        return found
+        media = enumerate(self.materials)
+        return {k: self.beginning(k) for k, medium in media if isinstance(medium, Gradient)}
+
+    def beginning(self, place: int) -> int:
+        """Return the number of the surface behind which the medium `place` (from 0) begins, in
+        whose axes it is given: mirrors and coordinate breaks lie within a medium.
+        """
+        while place in self.mirrors or place in self.breaks:
+            place -= 1
+        return place
 
     def spaces(self, wavelength: float | Tensor) -> dict[int, Space]:
         """Return the gaps in which rays bend, by the place of their medium; wavelengths in nm."""
@@ -216,10 +220,7 @@ class OpticalSystem:
         It is given in the axes of the surface in front of the crystal.
         """
         medium: Any = self.materials[place]
-        surface = place
-        while surface in self.mirrors or surface in self.breaks:
-            surface -= 1
-        return turned_axis(medium.axis, self.axes[surface - 1], self.dtype)
+        return turned_axis(medium.axis, self.axes[self.beginning(place) - 1], self.dtype)
 
     def _finer(self, wavelength: float | Tensor) -> float | Tensor:
         """Return wavelengths on the lens's device, no less precise than the lens."""

@@ -119,7 +119,7 @@ def _profile(real: types.Type) -> tuple[Any, Any, Any]:
 
 @cache
 def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
-    """Compile how a block of rays is filled, a drift and a kick, their tangents and their adjoint.
+    """Compile how a block of rays begins, a drift and a kick, their tangents and their adjoint.
 
     Rows of a block follow each other at a distance that is known, so that several rays are taken at
     a time.
@@ -136,6 +136,20 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             for i in range(_BLOCK):
                 ray = first + i
                 work[row * _BLOCK + i] = rows[row * count + ray] if ray < count else zero
+
+    @njit(**OPTIONS)
+    def begin_block(job_, block, first, both):  # noqa: ANN001, ANN202
+        """Fill a block with motions, steps and bases, and with tangents or cotangents."""
+        job, w = carray(job_, _JOB), carray(block, _WORK)
+        count = job[RAYS]
+        times, bases = carray(at(job[TIME]), UNBOUNDED), carray(at(job[BASE]), UNBOUNDED)
+        fill(job, block, job[MOTION], count, first)
+        if both:
+            fill(job, shifted(block, _C * _BLOCK), job[COTANGENT], count, first)
+        for i in range(_BLOCK):
+            ray = min(first + i, count - 1)
+            w[_H * _BLOCK + i] = times[ray] / real(job[STEPS])
+            w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
 
     @njit(**OPTIONS)
     def onwards(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
@@ -201,53 +215,23 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             w[(_C + 4) * _BLOCK + i] = b + d * (ry + p * v)
             w[(_C + 5) * _BLOCK + i] = e + d * (rz + p * s)
 
-    return fill, onwards, along, backwards
+    return begin_block, onwards, along, backwards
 
 
 def carry_driver(real: types.Type) -> Callable[..., None]:
     """Compile the driver that carries blocks `first` to `end` of rays through all steps."""
-    at = real_at(real)
-    fill, onwards, _, _ = _stages(real)
-    kicks = tuple(real(kick) for kick in KICKS)
-    drifts = tuple(real(drift) for drift in DRIFTS)
-    double, zero = real(2.0) * kicks[0], real(0.0)
-
-    def kernel(job_, first, end):  # noqa: ANN001, ANN202
-        job = carray(job_, _JOB)
-        count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
-        motion = carray(at(job[MOTION]), UNBOUNDED)
-        times, bases = carray(at(job[TIME]), UNBOUNDED), carray(at(job[BASE]), UNBOUNDED)
-        n = carray(at(job[PROFILE]), COEFFICIENTS)
-        c = (
-            n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
-        )  # fmt: skip
-        block = at(job[WORK])
-        w = carray(block, _WORK)
-        for number in range(first, end):
-            begin = number * _BLOCK
-            fill(job, block, job[MOTION], count, begin)
-            for i in range(_BLOCK):
-                ray = min(begin + i, count - 1)
-                w[_H * _BLOCK + i] = times[ray] / real(steps)
-                w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
-            onwards(block, c, squared, zero, kicks[0])
-            for step in range(steps):
-                for stage in range(_STAGES):
-                    kick = kicks[stage + 1]
-                    if stage == _STAGES - 1 and step < steps - 1:
-                        kick = double
-                    onwards(block, c, squared, drifts[stage], kick)
-            for row in range(_PARTS):
-                for i in range(min(_BLOCK, count - begin)):
-                    motion[row * count + begin + i] = w[row * _BLOCK + i]
-
-    return kernel
+    return _carrier(real, False)
 
 
 def carry_tangent_driver(real: types.Type) -> Callable[..., None]:
     """Compile the driver that carries tangents of blocks of rays along with them to their ends."""
+    return _carrier(real, True)
+
+
+def _carrier(real: types.Type, tangents: bool) -> Callable[..., None]:
     at = real_at(real)
-    fill, _, along, _ = _stages(real)
+    begin_block, onwards, along, _ = _stages(real)
+    stage_of, moved, address = (along, _C, COTANGENT) if tangents else (onwards, 0, MOTION)
     kicks = tuple(real(kick) for kick in KICKS)
     drifts = tuple(real(drift) for drift in DRIFTS)
     double, zero = real(2.0) * kicks[0], real(0.0)
@@ -255,9 +239,7 @@ def carry_tangent_driver(real: types.Type) -> Callable[..., None]:
     def kernel(job_, first, end):  # noqa: ANN001, ANN202
         job = carray(job_, _JOB)
         count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
-        tangents = carray(at(job[COTANGENT]), UNBOUNDED)
-        of_bases = carray(at(job[OF_BASE]), UNBOUNDED)
-        times, bases = carray(at(job[TIME]), UNBOUNDED), carray(at(job[BASE]), UNBOUNDED)
+        found = carray(at(job[address]), UNBOUNDED)
         n = carray(at(job[PROFILE]), COEFFICIENTS)
         c = (
             n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
@@ -266,23 +248,22 @@ def carry_tangent_driver(real: types.Type) -> Callable[..., None]:
         w = carray(block, _WORK)
         for number in range(first, end):
             begin = number * _BLOCK
-            fill(job, block, job[MOTION], count, begin)
-            fill(job, shifted(block, _C * _BLOCK), job[COTANGENT], count, begin)
-            for i in range(_BLOCK):
-                ray = min(begin + i, count - 1)
-                w[_H * _BLOCK + i] = times[ray] / real(steps)
-                w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
-                w[_OF_BASE * _BLOCK + i] = of_bases[ray * job[BASE_STEP]]
-            along(block, c, squared, zero, kicks[0])
+            begin_block(job_, block, begin, tangents)
+            if tangents:
+                of_bases = carray(at(job[OF_BASE]), UNBOUNDED)
+                for i in range(_BLOCK):
+                    ray = min(begin + i, count - 1)
+                    w[_OF_BASE * _BLOCK + i] = of_bases[ray * job[BASE_STEP]]
+            stage_of(block, c, squared, zero, kicks[0])
             for step in range(steps):
                 for stage in range(_STAGES):
                     kick = kicks[stage + 1]
                     if stage == _STAGES - 1 and step < steps - 1:
                         kick = double
-                    along(block, c, squared, drifts[stage], kick)
+                    stage_of(block, c, squared, drifts[stage], kick)
             for row in range(_PARTS):
                 for i in range(min(_BLOCK, count - begin)):
-                    tangents[row * count + begin + i] = w[(_C + row) * _BLOCK + i]
+                    found[row * count + begin + i] = w[(moved + row) * _BLOCK + i]
 
     return kernel
 
@@ -290,7 +271,7 @@ def carry_tangent_driver(real: types.Type) -> Callable[..., None]:
 def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
     """Compile the driver that takes cotangents of blocks of rays back to their beginnings."""
     at = real_at(real)
-    fill, _, _, backwards = _stages(real)
+    begin_block, _, _, backwards = _stages(real)
     kicks = tuple(real(kick) for kick in KICKS)
     drifts = tuple(real(drift) for drift in DRIFTS)
     double, zero = real(2.0) * kicks[0], real(0.0)
@@ -300,7 +281,6 @@ def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
         count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
         cotangent = carray(at(job[COTANGENT]), UNBOUNDED)
         of_bases = carray(at(job[OF_BASE]), UNBOUNDED)
-        times, bases = carray(at(job[TIME]), UNBOUNDED), carray(at(job[BASE]), UNBOUNDED)
         n = carray(at(job[PROFILE]), COEFFICIENTS)
         c = (
             n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
@@ -309,12 +289,8 @@ def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
         w = carray(block, _WORK)
         for number in range(first, end):
             begin = number * _BLOCK
-            fill(job, block, job[MOTION], count, begin)
-            fill(job, shifted(block, _C * _BLOCK), job[COTANGENT], count, begin)
+            begin_block(job_, block, begin, True)
             for i in range(_BLOCK):
-                ray = min(begin + i, count - 1)
-                w[_H * _BLOCK + i] = times[ray] / real(steps)
-                w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
                 w[_OF_BASE * _BLOCK + i] = zero
             for step in range(steps):
                 for stage in range(_STAGES - 1, -1, -1):
