@@ -26,7 +26,7 @@ from benchmarks.tracing import FORWARD, GRADIENT, GRADIENT_OF_RAYS, Plan, compar
 
 from dolens.errors import InputError
 
-PARTS = ("trace", "rays", "memory", "peak", "jacobian", "b_spline", "render", "start")
+PARTS = ("trace", "light", "rays", "memory", "peak", "jacobian", "b_spline", "render", "start")
 BUSY = 0.7  # processes of the last minute
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
@@ -118,6 +118,8 @@ def _measure(results: Results, plan: Plan, options: argparse.Namespace) -> None:
     one_or_all = plan.lenses[:1] if options.quick else plan.lenses
     if "trace" in parts:
         tracing.measure(results, plan, (FORWARD, GRADIENT))
+    if "light" in parts and plan.device.type == "cpu":
+        tracing.measure_light(results, plan)
     if "rays" in parts:
         fewer = plan.rays[-1:] if options.quick else [n for n in plan.rays if n <= 10**6]
         chosen = {"rays": fewer, "lenses": one_or_all}

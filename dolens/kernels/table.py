@@ -171,11 +171,12 @@ class LossTable:
         numbers: float64, contiguous: the absorption (media, wavelengths), 1/mm, with the rows of
             `SurfaceTable.indices`; of S steps the ratios (S, wavelengths), of the index in front to
             that beyond; 2/(1 - lowest cosine u_0) of each, s (S,); the coefficients (S,
-            wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 8; then the same series
-            again, and its derivative with respect to u, as the kernels sum them.
-        steps: (steps, 3), int64, on the CPU: which of the S, in their order, a step has, or -1; a
-            `Cosine`; and how many of the K terms are summed, a multiple of 8: as powers of x, which
-            is faster, or, where it is negative, as T_k.
+            wavelengths, K) of T_k(x), x = 1 - s·(1 - u), K a multiple of 8; then, as the kernels
+            sum them, the same series again, its derivative with respect to u, and the series of
+            0 < x ≤ 1 as powers of 2x - 1, which has fewer terms.
+        steps: (steps, 4), int64, on the CPU: which of the S, in their order, a step has, or -1; a
+            `Cosine`; how many of the K terms are summed, a multiple of 8: as powers of x, which is
+            faster, or, where it is negative, as T_k; and how many powers of 2x - 1, or 0.
         series: S.
         absorbs: whether any medium does.
     """

@@ -21,7 +21,7 @@ from dolens.errors import InputError
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
 from dolens.optics.coatings import CoatingState
 from dolens.optics.materials import Medium
-from dolens.optics.packing import LaidOut
+from dolens.optics.packing import LaidOut, lay_out
 from dolens.optics.records import Records, tensor
 from dolens.optics.system import OpticalSystem
 
@@ -30,6 +30,9 @@ _BETWEEN = (Kind.CHANGE_AXES, Kind.LENS_AXES, Kind.SENSOR, Kind.DEFLECT)
 _GROUP = 8  # coefficients that a kernel takes at once
 # Lengths of series that are tried, and how many of the last coefficients must be small.
 _TERMS, _LAST = (8, 12, 16, 24, 32, 48, 64, 96, 128), 3
+_KEPT = 64  # tables of a lens
+# Of a share, for the precision in which rays are traced.
+_NEGLIGIBLE = {torch.float64: 1e-13, torch.float32: 3e-8}
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,16 @@ def _powers(count: int) -> Tensor:
     for k in range(2, count):
         map_[k] = 2.0 * map_[k - 1].roll(1) - map_[k - 2]
     return map_
+
+
+@cached_tensors(maxsize=16)
+def _nearer(count: int) -> Tensor:
+    """Return the map of a series's coefficients to those of the same polynomial as a series in
+    2x - 1.
+    """
+    x = 0.5 + 0.5 * torch.cos(_angles(count))
+    of_nodes = torch.cos(torch.arange(count, dtype=torch.float64)[:, None] * torch.acos(x))
+    return of_nodes @ _transform(count)
 
 
 @cached_tensors(maxsize=16)
@@ -265,6 +278,48 @@ def _computed_series(
     return SurfaceSeries(coefficients(enough), cosine, beyond)
 
 
+def loss_table_of(
+    system: OpticalSystem,
+    wavelengths: tuple[float, ...],
+    sense: float,
+    first: int,
+    last: int,
+    to_sensor: bool,
+) -> LossTable | None:
+    """Return the losses at the steps of a lens, or a part of it, that is traced; None where
+    `losses_of` finds none.  What needs no graph is kept while the coatings have the same numbers.
+
+    Args:
+        system: the lens.
+        wavelengths: nm, in the order of a table's columns of indices.
+        sense: as of `lay_out`, as the further arguments.
+        first: surface.
+        last: surface.
+        to_sensor: whether rays go there.
+    """
+    coatings = [surface.coating for surface in system.surfaces if surface.coating is not None]
+    numbers = [number for coating in coatings for number in coating.tensors]
+    stays = not system.index_offsets
+    stays &= not (torch.is_grad_enabled() and any(n.requires_grad for n in numbers))
+    values = tuple(float(number.detach()) for number in numbers) if stays else ()
+    kept = system.derived.setdefault(("losses", sense, first, last, to_sensor), {})
+    key = (wavelengths, values)
+    if stays and key in kept:
+        return kept[key]
+    with torch.inference_mode(False):  # such a table could never be saved for a backward pass
+        waves = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
+        losses = losses_of(system, waves, sense, 1e-12 if system.dtype == torch.float64 else 1e-7)
+        table = None
+        if losses is not None:
+            found = lay_out(system, sense, first, last, to_sensor)
+            table = loss_table(losses, found, len(wavelengths), len(system.surfaces))
+    if stays:
+        if len(kept) >= _KEPT:
+            kept.clear()
+        kept[key] = table
+    return table
+
+
 def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) -> LossTable:
     """Return the losses at a table's steps.
 
@@ -301,9 +356,11 @@ def loss_table(losses: Losses, found: LaidOut, wavelengths: int, surfaces: int) 
     by_powers = small[:, None, None]
     summed = torch.where(by_powers, powers, summed)
     slopes = torch.where(by_powers, slopes @ _powers(terms), slopes)
-    of_steps = counts[steps[:, 0]] if len(order) else steps[:, 0]
-    steps = torch.cat((steps, of_steps[:, None]), 1)
-    parts = (of_media, ratios.double()[order], scales, coefficients, summed, slopes)
+    near, near_counts = _near(coefficients.detach(), counts, found.scalars[0].dtype)
+    of_series = torch.stack((counts, near_counts), 1)
+    of_steps = of_series[steps[:, 0]] if len(order) else steps
+    steps = torch.cat((steps, of_steps), 1)
+    parts = (of_media, ratios.double()[order], scales, coefficients, summed, slopes, near)
     numbers = torch.cat([part.reshape(-1) for part in parts])
     return LossTable(numbers, steps, len(order), absorption is not None)
 
@@ -317,6 +374,20 @@ def _summed(coefficients: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:
     last = torch.where(coefficients != 0.0, place, 1).amax((1, 2))
     count = (last + _GROUP - 1) // _GROUP * _GROUP
     return torch.where(small, count, -count), small
+
+
+def _near(coefficients: Tensor, counts: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return each series (S, W, K) for 0 < x ≤ 1 as powers of 2x - 1, and how many are summed,
+    (S,): none where these are no fewer than `counts`, or would lose digits.
+    """
+    terms = coefficients.shape[-1]
+    near = coefficients @ _nearer(terms)
+    left = near.abs().flip(-1).cumsum(-1).flip(-1).amax(1)  # of the terms from each on
+    count = (left > _NEGLIGIBLE[dtype]).sum(-1).clamp(min=1)
+    count = (count + _GROUP - 1) // _GROUP * _GROUP
+    powers = torch.where(torch.arange(terms) < count[:, None, None], near, 0.0) @ _powers(terms)
+    holds = (powers.abs().sum(-1) < POWERS).all(-1) & (count < counts.abs())
+    return powers, torch.where(holds, count, 0)
 
 
 @cached_tensors(maxsize=256)

@@ -16,10 +16,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from dolens.errors import InputError
+from dolens.kernels.table import LossTable
 from dolens.optics.autograd import is_transformed
 from dolens.optics.eager_trace import trace_by_operator, trace_eagerly, traces_eagerly
 from dolens.optics.elements import to_lens_axes
-from dolens.optics.losses import Losses, loss_table, losses_of
+from dolens.optics.losses import Losses, loss_table, loss_table_of
 from dolens.optics.packing import lay_out, unsupported
 from dolens.optics.rays import Components, Rays, TracedRays, finite_rays
 from dolens.optics.system import OpticalSystem
@@ -62,9 +63,13 @@ def trace_rays(
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
     backend = "reference" if record else choose_backend(system, rays)
+    lost: LossTable | None = None
     if transmission and losses is None and backend != "reference":
-        losses = _losses(system, rays.wavelength, sense) if backend == "cpu" else None
-        backend = backend if losses is not None else "reference"
+        if backend == "cpu":
+            waves = _few(rays.wavelength)
+            if waves is not None:
+                lost = loss_table_of(system, waves, sense, first, end, to_sensor)
+        backend = backend if lost is not None else "reference"
     reference = backend == "reference"
     if losses is not None and backend != "cpu":
         raise InputError(f"losses as series are taken by the CPU's kernels, not by '{backend}'")
@@ -82,7 +87,6 @@ def trace_rays(
     position, direction, shape = _joined(system, rays, ray, before)
     found = lay_out(system, sense, first, end, to_sensor)
     which = _columns(rays.wavelength, shape, system.device)
-    lost = None
     if losses is not None:
         wavelengths = rays.wavelength.numel() if isinstance(rays.wavelength, Tensor) else 1
         lost = loss_table(losses, found, wavelengths, len(system.surfaces))
@@ -103,16 +107,13 @@ def trace_rays(
     return TracedRays(position, direction, valid, status, surface, path, transmission=share)
 
 
-def _losses(system: OpticalSystem, wavelength: float | Tensor, sense: float) -> Losses | None:
-    """Return a lens's losses as the CPU's kernels take them; None where the reference must do."""
-    if isinstance(wavelength, Tensor):
-        if wavelength.numel() > _FEW or (wavelength.requires_grad and torch.is_grad_enabled()):
-            return None
-        waves = wavelength.reshape(-1)
-    else:
-        waves = torch.tensor([wavelength], dtype=torch.float64)
-    tolerance = 1e-12 if system.dtype == torch.float64 else 1e-7
-    return losses_of(system, waves, sense, tolerance)
+def _few(wavelength: float | Tensor) -> tuple[float, ...] | None:
+    """Return wavelengths, nm, whose losses the CPU's kernels take; None where there are more."""
+    if not isinstance(wavelength, Tensor):
+        return (float(wavelength),)
+    if wavelength.numel() > _FEW or (wavelength.requires_grad and torch.is_grad_enabled()):
+        return None
+    return tuple(wavelength.detach().double().reshape(-1).tolist())
 
 
 def from_sensor(system: OpticalSystem, rays: Rays) -> Rays:

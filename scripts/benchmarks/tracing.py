@@ -1,6 +1,6 @@
 """Forward traces and gradients, as a user calls them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +11,7 @@ from benchmarks.errors import gradient_error, reference_case, sensor_error
 from benchmarks.golden import golden_error
 from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, Timing, by_turns
-from dolens import Rays
+from dolens import Lens, Rays
 
 # The reference keeps every intermediate (0.5 to 15 kB a ray): it traces a bundle in pieces, and of
 # the largest bundles only the first rays; its time a ray does not depend on their number by then.
@@ -119,6 +119,54 @@ def compare(
                 filter(None, (_pieces(part, case, backend, count), row["note"]))
             )
         results.add(Row(**row | {"part": title or part}))
+
+
+def measure_light(results: Results, plan: Plan) -> None:
+    """Rows of a trace that finds the share of light that bare glass passes, beside a plain one."""
+    for name in plan.lenses:
+        for dtype in plan.dtypes:
+            lens = load(name, dtype, "cpu", plan.device)
+            bare = lens.coated("none")
+            exact = load(name, torch.float64, "reference", plan.device).coated("none")
+            for count in plan.rays:
+                rays = make_rays(name, count, dtype, plan.device)
+                case, few = Case(name, lens, rays), part_of(rays, 0, 10**4)
+                with torch.no_grad():
+                    known = exact.trace(few, transmission=True)
+                    found = bare.trace(few, transmission=True).transmission
+                error = float((found - known.transmission)[known.valid].abs().max())
+                for threads in plan.threads:
+                    torch.set_num_threads(threads)
+                    for part in (FORWARD, GRADIENT):
+                        runs = {"cpu": (lens, False), "cpu, light": (bare, True)}
+                        timings = by_turns(
+                            [
+                                Contender(backend, _light_runner(part, *run, rays), count)
+                                for backend, run in runs.items()
+                            ],
+                            plan.seconds,
+                            plan.device,
+                        )
+                        timing = timings["cpu, light"]
+                        row = row_of_timing(
+                            f"light, {part}", case, "cpu, light", dtype, threads, count, timing,
+                            "ns/ray/surface",
+                        )  # fmt: skip
+                        row |= {"error": error, "error_unit": "share of light"}
+                        row |= {"error_against": "float64 reference, same rays"}
+                        results.add(Row(**row | beside(timing, timings["cpu"])))
+
+
+def _light_runner(part: str, lens: Lens, light: bool, rays: Rays) -> Callable[[], None]:
+    def run() -> None:
+        with torch.set_grad_enabled(part == GRADIENT):
+            hit = lens.trace(rays, transmission=light)
+        if part == GRADIENT:
+            lens.zero_grad(set_to_none=True)
+            total = hit.position.square().sum()
+            (total + hit.transmission.sum() if light else total).backward()
+
+    return run
 
 
 def row_of_timing(

@@ -299,6 +299,26 @@ COATED = {
 }  # fmt: skip
 
 
+def test_the_share_follows_a_film_that_changes_in_place():
+    """What is kept of a lens's losses goes by the films' numbers, wavelengths and surfaces."""
+    lens = lens_from_prescription(COATED)
+    rays = bundle(lens, 80)
+    film = lens.get_parameter("surfaces.1.coating.thickness_1")
+    for backend in ("cpu", "reference"):
+        lens.backend = backend
+        with torch.no_grad():
+            shares = [lens.trace(rays, transmission=True, last=k).transmission for k in (1, 3)]
+            film.mul_(2.0)
+            shares.append(lens.trace(rays, transmission=True).transmission)
+            film.mul_(0.5)
+        shares.append(lens.trace(replace(rays, wavelength=450.0), transmission=True).transmission)
+        found = torch.stack(shares).nanmean(1).detach()
+        if backend == "cpu":
+            fast = found
+    assert len(set(found.tolist())) == 4
+    assert (fast - found).abs().max() < 1e-9
+
+
 def test_coatings_and_glasses_as_series_lose_what_they_lose():
     """Values and the derivatives with respect to curvatures and the layers' thicknesses."""
     lens = lens_from_prescription(COATED)
@@ -336,6 +356,27 @@ def test_a_trace_that_is_asked_for_transmission_takes_series(sense, dtype, bound
         )
         assert bool(slow.valid.sum() > 20)
         assert (fast.transmission - slow.transmission)[slow.valid].abs().max() < bound
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(F64, 2e-12), (torch.float32, 5e-6)])
+def test_bare_glass_passes_what_fresnel_says_at_all_angles(dtype, bound):
+    """Blocks of rays within and beyond 60°, where the kernels sum other series, and of both."""
+    plate = {"type": "plane", "semi_diameter": 1e6}
+    surfaces = {
+        "1": {**plate, "thickness": 1e-3, "material": "1.5"},
+        "2": {**plate, "material": "air"},
+    }
+    given = {"surfaces": surfaces, "coating": "none", "sensor": {"distance": 1e-3}}
+    lens = lens_from_prescription(given, dtype)
+    lens.backend = "cpu"
+    angle = torch.linspace(0.0, 89.0, 512, dtype=F64)
+    angle = torch.cat((angle, angle.view(-1, 2).T.flatten(), angle.flip(0))).to(dtype).double()
+    tilt = torch.stack((torch.zeros_like(angle), angle.deg2rad().sin(), angle.deg2rad().cos()), -1)
+    hit = lens.trace(Rays(torch.zeros_like(tilt), tilt.to(dtype)), transmission=True)
+    front, behind = tilt[:, 2], (1.0 - (tilt[:, 1] / 1.5).square()).sqrt()
+    s = 6.0 * front * behind / (front + 1.5 * behind).square()
+    p = 6.0 * front * behind / (1.5 * front + behind).square()
+    assert (hit.transmission - (0.5 * (s + p)).square()).abs().max() < bound
 
 
 def test_light_that_glass_reflects_within():

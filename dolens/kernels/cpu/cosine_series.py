@@ -17,9 +17,11 @@ from dolens.kernels.cpu.layout import (
     CODE_ROW,
     CONIC,
     COSINE,
+    ENDED,
     FACTORS,
     KIND,
     LOSS,
+    NEAR,
     OFFSET,
     ROWS_OF_A_SERIES,
     SAG_AND_SLOPES,
@@ -87,6 +89,7 @@ def cosine_series(real: types.Type) -> CosineSeries:
     at = real_at(real)
     gradient = scalar(conic_gradient, real)
     zero, one, two, tiny = real(0.0), real(1.0), real(2.0), real(TINY)
+    least = real(1e-3)  # that x is taken for positive from; 2x - 1 > -1 then
 
     @njit(**INLINED)
     def codes_of(job, k):  # noqa: ANN001, ANN202
@@ -298,8 +301,9 @@ def cosine_series(real: types.Type) -> CosineSeries:
 
     @njit(**INLINED)
     def place_of(job, codes, part):  # noqa: ANN001, ANN202
-        """Return where a step's coefficients begin as they are summed (part 1), or those of its
-        slope (part 2): of the rays' wavelength, or of the first where they differ.
+        """Return where a step's coefficients begin as they are summed (part 1), those of its slope
+        (part 2), or the powers of 2x - 1 (part 3): of the rays' wavelength, or of the first where
+        they differ.
         """
         all_ = job[jobs.SERIES] * job[jobs.WAVELENGTHS] * job[jobs.TERMS]
         common = job[jobs.WAVELENGTH] - 1
@@ -316,8 +320,29 @@ def cosine_series(real: types.Type) -> CosineSeries:
             sum_chebyshev(job, place_of(job, codes, part), -codes[SUMMED], x, sum_, before)
 
     @njit(**INLINED)
-    def multiply(job, codes, lanes, rows):  # noqa: ANN001, ANN202
+    def is_near(job, codes, after, rows):  # noqa: ANN001, ANN202
+        """Return whether x > 0 for all rays of a block, which have one wavelength; the arguments
+        are then turned to 2x - 1.
+        """
+        if job[jobs.WAVELENGTH] == 0 or codes[NEAR] == 0:
+            return False
+        x, state = carray(shifted(rows, ARGUMENT), BLOCK), carray(after, STATE)
+        steep = zero
+        for i in range(BLOCK):
+            steep += one if (x[i] < least) & (state[ENDED + i] == zero) else zero
+        if steep > zero:
+            return False
+        for i in range(BLOCK):
+            near = two * x[i] - one
+            x[i] = near if near > -one else -one
+        return True
+
+    @njit(**INLINED)
+    def multiply(job, codes, lanes, after, rows):  # noqa: ANN001, ANN202
         """Multiply the row of shares by a step's series."""
+        if is_near(job, codes, after, rows):
+            multiply_by_powers(job, place_of(job, codes, 3), codes[NEAR], rows)
+            return
         if job[jobs.WAVELENGTH] > 0 and codes[SUMMED] > 0:
             multiply_by_powers(job, place_of(job, codes, 1), codes[SUMMED], rows)
             return
@@ -327,8 +352,12 @@ def cosine_series(real: types.Type) -> CosineSeries:
             r[SHARES + i] *= r[SUM + i]
 
     @njit(**INLINED)
-    def keep(job, codes, lanes, rows, own):  # noqa: ANN001, ANN202
+    def keep(job, codes, lanes, after, rows, own):  # noqa: ANN001, ANN202
         """Fill the rows of a step's series, of its slope, and of the share behind it."""
+        if is_near(job, codes, after, rows):
+            scale = two * scale_of(job, codes)
+            keep_powers(job, place_of(job, codes, 3), codes[NEAR], scale, rows, own)
+            return
         if job[jobs.WAVELENGTH] > 0 and codes[SUMMED] > 0:
             scale = scale_of(job, codes)
             keep_powers(job, place_of(job, codes, 1), codes[SUMMED], scale, rows, own)

@@ -102,8 +102,8 @@ PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 7, Code.ROW
 # Those of the even asphere that other shapes add to.
 ASPHERE_SAG, ASPHERE_HESSIAN, ASPHERE_PARAMETERS = range(Code.ROW + 10, Code.ROW + 13)
 # A row of `LossTable.steps`: its series plus one, or zero; and the rest.
-LOSS, COSINE, SUMMED = range(Code.ROW + 13, Code.ROW + 16)
-CODE_ROW = Code.ROW + 16
+LOSS, COSINE, SUMMED, NEAR = range(Code.ROW + 13, Code.ROW + 17)
+CODE_ROW = Code.ROW + 17
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 DEFLECT, SPHERE, CONIC = int(Kind.DEFLECT), int(Kind.SPHERE), int(Kind.CONIC)

@@ -166,7 +166,7 @@ def passed_light(real: types.Type) -> PassedLight:
             return
         cosine, x = shifted(rows, COSINES), shifted(rows, ARGUMENT)
         set_cosine(job, codes, lanes, before, after, cosine, x)
-        multiply(job, codes, lanes, rows)
+        multiply(job, codes, lanes, after, rows)
 
     @njit(**INLINED)
     def store_share(job, start, count):  # noqa: ANN001, ANN202
@@ -189,7 +189,7 @@ def passed_light(real: types.Type) -> PassedLight:
                 own = shifted(rows, NEXT * (codes[LOSS] - 1))
                 cosine, x = shifted(own, COSINES), shifted(rows, ARGUMENT)
                 set_cosine(job, codes, lanes, now, then, cosine, x)
-                keep_series(job, codes, lanes, rows, own)
+                keep_series(job, codes, lanes, then, rows, own)
 
     @njit(**INLINED)
     def turn_round(job, lanes, count):  # noqa: ANN001, ANN202

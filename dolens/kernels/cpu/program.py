@@ -43,6 +43,7 @@ from dolens.kernels.cpu.layout import (
     FORWARD,
     LOSS,
     LOSS_ROWS,
+    NEAR,
     PARAMETERS,
     PHASE_AND_SLOPES,
     PHASE_HESSIAN,
@@ -124,8 +125,8 @@ def _steps(codes: bytes, integers: bytes, real: str, derivatives: bool, losses: 
     rows = np.zeros((max(len(table), 1), CODE_ROW), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
     if losses:
-        series = np.frombuffer(losses, dtype=np.int64).reshape(-1, 3)
-        rows[: len(table), [LOSS, COSINE, SUMMED]] = series
+        series = np.frombuffer(losses, dtype=np.int64).reshape(-1, 4)
+        rows[: len(table), [LOSS, COSINE, SUMMED, NEAR]] = series
         rows[: len(table), LOSS] += 1
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
@@ -312,7 +313,7 @@ class Program:
         ratios = self.table.indices.numel()
         coefficients = ratios + losses.series * (wavelengths + 1)
         terms = losses.numbers.numel() - coefficients
-        terms //= max(3 * losses.series * wavelengths, 1)
+        terms //= max(4 * losses.series * wavelengths, 1)  # four arrays of one shape
         self._losses = losses  # held
         # Neighbours in a job.
         self.job[jobs.LOSSES : jobs.ABSORBS + 1] = (
