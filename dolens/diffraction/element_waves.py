@@ -75,6 +75,9 @@ def element_number(system: OpticalSystem) -> int:
         raise InputError(f"{what}: the stop, surface {system.stop}, stands behind surface {number}")
     if any(element.last >= number for element in system.elements):
         raise InputError(f"{what}: surface {number}, or one behind it, belongs to a moved element")
+    kind = system.surfaces[number - 1].shape.kind
+    if kind not in ("plane", "aperture"):
+        raise InputError(f"{what}: surface {number} is no plane, but a {kind}")
     for at in range(number + 1, len(system.surfaces) + 1):
         surface = system.surfaces[at - 1]
         if surface.shape.kind not in ("plane", "aperture") or surface.deflection is not None:

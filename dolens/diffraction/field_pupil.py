@@ -38,6 +38,10 @@ _RAYS = 384
 COARSER = 2.0**-0.5
 # Share of the light whose rays the window of a point spread function holds.
 _HELD = 0.99
+# A window holds the rays and so many Airy radii around them.
+_BEYOND, _AIRY_RADII = 1.1, 3.5
+# Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
+AIRY_STEPS, MOST_STEPS = 3.5, 512
 # Points of the line that rays are counted on for their transfer function, and points of a pupil
 # that are evaluated at a time.
 _LINE, _PIECE = 4096, 1 << 14
@@ -117,6 +121,52 @@ class FieldPupil:
         within = light[order].cumsum(0)
         at = int(torch.searchsorted(within, _HELD * within[-1]))
         return float(distance[order][min(at, len(order) - 1)])
+
+    @property
+    def window_half_width(self) -> float:
+        """Return the half width (mm) of a window that holds the light."""
+        return _BEYOND * self.spot_radius + _AIRY_RADII * self.airy_radius
+
+    def mean_irradiance(self, half: float, cells: int) -> tuple[Tensor, float, float]:
+        """Return means over the cells of a window (M, M), 1/mm², the highest irradiance, and a
+        perfect lens's, NaN where rays alone make the image.
+
+        Args:
+            half: half width of the window, mm.
+            cells: M, along each side.
+        """
+        parts = 1
+        if self.diffraction:
+            wanted = math.ceil(2.0 * half * AIRY_STEPS / self.airy_radius / cells)
+            parts = max(1, min(wanted, MOST_STEPS // cells))
+        fine = parts * cells
+        grid = (torch.arange(fine).to(self.weights) + 0.5) * (2.0 * half / fine) - half
+        irradiance, perfect = self.irradiance(grid, grid)
+        peak = float(irradiance.amax())
+        if self.diffraction:
+            # The highest point lies between the samples.
+            row, column = divmod(int(irradiance.argmax()), fine)
+            near = torch.linspace(-1.0, 1.0, 17).to(grid) * (2.0 * half / fine)
+            peak = float(self.irradiance(grid[column] + near, grid[row] + near)[0].amax())
+        means = irradiance.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
+        return means, peak, perfect
+
+    def changes(self, half: float, cells: int) -> tuple[Tensor, Tensor]:
+        """Return the irradiance (M, M), 1/mm², at the centres of a window's cells, and what half of
+        the pupil's samples change of it.  Arguments as of `mean_irradiance`.
+        """
+        grid = (torch.arange(cells).to(self.weights) + 0.5) * (2.0 * half / cells) - half
+        fine, coarse = (self.irradiance(grid, grid, share)[0] for share in (1.0, COARSER))
+        return fine, fine - coarse
+
+    def sampling_error(self, half: float, cells: int) -> float:
+        """Return the largest of these changes over the irradiance's peak; NaN where rays alone make
+        the image.
+        """
+        if not self.diffraction:
+            return math.nan
+        fine, changes = self.changes(half, cells)
+        return float(changes.abs().amax() / fine.amax())
 
     def irradiance(self, x: Tensor, y: Tensor, share: float = 1.0) -> tuple[Tensor, float]:
         """Compute the irradiance on a regular grid, with the share of the light as unit.

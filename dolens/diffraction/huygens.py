@@ -31,7 +31,6 @@ from dolens.diffraction.point_spread import (
     PointSpread,
     airy_radius_um,
     of_all_fields,
-    window_half_width,
 )
 from dolens.diffraction.propagation import direct_field, turns_across
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
@@ -141,7 +140,7 @@ def huygens_window(lens: Lens, where: Conditions) -> tuple[float, float]:
 
 def half_width_of(front: Wavefront, weights: Tensor) -> float:
     """Return the half width (mm) of a window that holds the light of W wavefronts of a field."""
-    return window_half_width(FieldPupil(front, weights, None, ""))
+    return FieldPupil(front, weights, None, "").window_half_width
 
 
 def rays_for(front: Wavefront, half: float, given: int | None, cells: int) -> int:

@@ -9,11 +9,7 @@ from torch import Tensor
 
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.modulation_transfer import field_directions, modulation
-from dolens.diffraction.element_spread import (
-    element_airy_radius_um,
-    element_half_width,
-    field_lights,
-)
+from dolens.diffraction.element_spread import field_spreads
 from dolens.diffraction.field_pupil import COARSER
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.point_spread import PointSpread, point_spread
@@ -128,9 +124,8 @@ def diffraction_modulation(
 
 def _element_window(lens: Lens, where: Conditions) -> tuple[float, float]:
     """Return half width and Airy radius, µm, of the window of a field behind an element."""
-    (light,) = field_lights(lens, where)
-    airy = element_airy_radius_um(light, where.weights)
-    return 1e3 * element_half_width(light, 1e-3 * airy), airy
+    (light,) = field_spreads(lens, where)
+    return 1e3 * light.half_width, light.airy_radius_um
 
 
 def _by_rays(lens: Lens, prepared: PreparedPupils, frequency: Tensor) -> dict[int, Tensor]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.diffraction.element_orders import even_irradiance, light_goes_by_orders, orders_of
 from dolens.diffraction.element_waves import ElementLight, element_light
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.propagation import (
@@ -33,6 +34,7 @@ from dolens.diffraction.pupil_fit import (
     regular_pupil,
     with_differentiable_bounds,
 )
+from dolens.diffraction.reference_sphere import chief_ray_intercepts
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.autograd import replay
@@ -135,7 +137,8 @@ def wave_kernels(
     tent, as in `axial_point_spread_functions`: the discrete convolution of a texture with it is the
     image, wherever the field is small enough for one kernel.
 
-    Behind a diffractive element light goes as `dolens.diffraction.element_waves` says.
+    Behind a diffractive element light goes as `dolens.diffraction.element_waves` says, and from one
+    between lenses as `element_orders` does.
 
     Where the Fourier transform does not hold, the integral is done directly, which takes a thousand
     times as long; the log says so and why, and so does `propagation`.
@@ -160,6 +163,8 @@ def wave_kernels(
     """
     settings = settings or DiffractionSettings()
     if system.diffractive:
+        if light_goes_by_orders(system):
+            return _by_orders(system, _object_points(points), wavelength, centres, window, settings)
         light = element_light(system, _object_points(points), wavelength, centres, settings)
         return _by_element(light, window, system.dtype)
     if settings.method == "spectrum":
@@ -202,6 +207,10 @@ def propagation(
 ) -> Propagation:
     """Say how `wave_kernels` of the same arguments propagates light by itself, and why."""
     settings = settings or DiffractionSettings()
+    if system.diffractive and light_goes_by_orders(system):
+        places = _object_points(points).to(torch.float64, system.device)
+        waves = torch.as_tensor(wavelength).to(places.slopes).expand(len(places))
+        system = orders_of(system.double(), places, waves)[0].system
     if system.diffractive:
         light = element_light(system, _object_points(points), wavelength, centres, settings)
         return _element_propagation(light, window)
@@ -239,6 +248,35 @@ def _by_element(light: ElementLight, window: PixelWindow, dtype: torch.dtype) ->
         return pixels.integrated(field)[..., None]
 
     return replay(kernel, [1] * len(plans), light.tensors).movedim(-1, 0)
+
+
+def _by_orders(
+    system: OpticalSystem,
+    points: ObjectPoints,
+    wavelength: Wavelengths,
+    centres: Centres,
+    window: PixelWindow,
+    settings: DiffractionSettings,
+) -> Tensor:
+    """Return kernels (N, size, size) of all orders of a lens's diffractive elements."""
+    system, dtype = system.double(), system.dtype
+    points = points.to(torch.float64, system.device)
+    waves = torch.as_tensor(wavelength).to(points.slopes).expand(len(points))
+    if centres is None:
+        centres = chief_ray_intercepts(system, points, waves)
+    centre = torch.as_tensor(centres).to(points.slopes)
+    total = torch.zeros((len(points), window.size, window.size)).to(points.slopes)
+    for order in orders_of(system, points, waves):
+        even = even_irradiance(order, points, waves, centre, window.half_width)
+        sharp = even.isnan().nonzero().flatten()
+        flat = torch.where(even.isnan(), 0.0, even)
+        total = total + (flat * window.pitch**2)[:, None, None]
+        if len(sharp):
+            kernels = wave_kernels(
+                order.system, points[sharp], waves[sharp], centre[sharp], window, settings
+            )
+            total = total.index_add(0, sharp, order.share[sharp, None, None] * kernels)
+    return total.to(dtype)
 
 
 @dataclass(frozen=True)

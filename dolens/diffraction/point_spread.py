@@ -11,23 +11,13 @@ from torch import Tensor
 from dolens.analysis.conditions import AtConditions, Conditions
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
-from dolens.diffraction.element_spread import (
-    element_airy_radius_um,
-    element_half_width,
-    element_sampling_error,
-    field_lights,
-    mean_irradiance,
-)
-from dolens.diffraction.field_pupil import COARSER, FieldPupil
+from dolens.diffraction.element_spread import field_spreads
+from dolens.diffraction.field_pupil import AIRY_STEPS, MOST_STEPS, FieldPupil
 from dolens.diffraction.field_wavefronts import PreparedPupils, prepare_pupils
 from dolens.diffraction.wavefront_map import wavefront_errors
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
-# The window holds the rays and so many Airy radii around them.
-_BEYOND, _AIRY_RADII = 1.1, 3.5
-# Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
-_STEPS, _MOST = 3.5, 512
 _CELLS = 128
 
 
@@ -144,10 +134,10 @@ def point_spread(
         if pupil is None:
             rows.append(FieldPointSpread.dark(cells))
             continue
-        half = window_half_width(pupil) if half_width_um is None else 1e-3 * half_width_um
-        irradiance, peak, perfect = _mean_irradiance(pupil, half, cells)
+        half = pupil.window_half_width if half_width_um is None else 1e-3 * half_width_um
+        irradiance, peak, perfect = pupil.mean_irradiance(half, cells)
         held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
-        how = pupil.diffraction, pupil.reason, _sampling_error(pupil, half, cells)
+        how = pupil.diffraction, pupil.reason, pupil.sampling_error(half, cells)
         row = FieldPointSpread(1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how)
         rows.append(row)
     found = prepared.wavefronts
@@ -160,18 +150,16 @@ def _behind_element(
     """Return the point spread functions of a lens with a diffractive element, all its orders."""
     where = where.that_count()
     rows, centres, airy = [], [], []
-    for light in field_lights(lens, where):
+    for light in field_spreads(lens, where):
         centres.append(light.centre[0].cpu())
-        if not bool((light.fit.wavefront.flux > 0.0).any()):
+        if not light.lit:
             rows.append(FieldPointSpread.dark(cells))
             continue
-        airy.append(element_airy_radius_um(light, where.weights))
-        half = 1e-3 * half_width_um if half_width_um else element_half_width(light, 1e-3 * airy[-1])
-        means, peak, perfect = mean_irradiance(light, where.weights, half, cells)
+        airy.append(light.airy_radius_um)
+        half = 1e-3 * half_width_um if half_width_um else light.half_width
+        means, peak, perfect = light.mean_irradiance(half, cells)
         held = float(means.sum()) * (2.0 * half / cells) ** 2
-        reason = light.plan(len(light) - 1, half).reason
-        error = element_sampling_error(light, where.weights, half, means)
-        how = peak / perfect, True, reason, error
+        how = peak / perfect, True, light.reason(half), light.sampling_error(half, means)
         rows.append(FieldPointSpread(1e3 * half, 1e-6 * means, held, *how))
     radius = airy[0] if airy else math.nan
     return of_all_fields(where, torch.stack(centres), radius, rows)
@@ -205,7 +193,7 @@ def diffraction_encircled_energy(
     found, pupils = prepared.wavefronts, prepared.pupils
     airy = airy_radius_um(lens, found.where)
     if radii_um is None:
-        reach = max((window_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
+        reach = max((pupil.window_half_width for pupil in pupils if pupil), default=4e-3 * airy)
         radii_um = torch.linspace(0.0, 1e3 * reach, 101, dtype=torch.float64)
     radii = checked_radii(radii_um)
     curves = [
@@ -221,41 +209,6 @@ def diffraction_encircled_energy(
     )
 
 
-def window_half_width(pupil: FieldPupil) -> float:
-    """Return the half width (mm) of a window that holds a field's light."""
-    return _BEYOND * pupil.spot_radius + _AIRY_RADII * pupil.airy_radius
-
-
-def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor, float, float]:
-    """Return means over cells (M, M), 1/mm², the highest sample, and a perfect lens's."""
-    parts = 1
-    if pupil.diffraction:
-        wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius / cells)
-        parts = max(1, min(wanted, _MOST // cells))
-    fine = parts * cells
-    grid = (torch.arange(fine).to(pupil.weights) + 0.5) * (2.0 * half / fine) - half
-    irradiance, perfect = pupil.irradiance(grid, grid)
-    peak = float(irradiance.amax())
-    if pupil.diffraction:
-        # The highest point lies between the samples.
-        row, column = divmod(int(irradiance.argmax()), fine)
-        near = torch.linspace(-1.0, 1.0, 17).to(grid) * (2.0 * half / fine)
-        peak = float(pupil.irradiance(grid[column] + near, grid[row] + near)[0].amax())
-    means = irradiance.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
-    return means, peak, perfect
-
-
-def _sampling_error(pupil: FieldPupil, half: float, cells: int) -> float:
-    """Return the largest change of the irradiance at cells' centres, over its peak, where the pupil
-    has half of its samples; NaN where rays alone make the image.
-    """
-    if not pupil.diffraction:
-        return math.nan
-    grid = (torch.arange(cells).to(pupil.weights) + 0.5) * (2.0 * half / cells) - half
-    fine, coarse = (pupil.irradiance(grid, grid, share)[0] for share in (1.0, COARSER))
-    return float((fine - coarse).abs().amax() / fine.amax())
-
-
 # Windows of its own that a field's encircled energy is followed for.
 _FAR = 4.0
 
@@ -266,11 +219,11 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
     # Far beyond its window, as the spot of another field may need, a field's curve stays level.
-    widest = _FAR * window_half_width(pupil)
+    widest = _FAR * pupil.window_half_width
     half = min(float(radii[-1]), widest) + 1e-9
     radii = radii.clamp(max=widest)
-    wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
-    cells = min(max(wanted, 2 * _CELLS), _MOST)
+    wanted = math.ceil(2.0 * half * AIRY_STEPS / pupil.airy_radius)
+    cells = min(max(wanted, 2 * _CELLS), MOST_STEPS)
     step = 2.0 * half / cells
     grid = (torch.arange(cells).to(pupil.weights) + 0.5) * step - half
     light = pupil.irradiance(grid, grid)[0].flatten() * step * step

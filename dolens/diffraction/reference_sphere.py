@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.errors import InputError
-from dolens.optics.aiming import aim
+from dolens.optics.aiming import AimedRays, aim
 from dolens.optics.image_surface import TangentPlanes
 from dolens.optics.paraxial import exit_pupil
 from dolens.optics.ray_tracing import trace_rays
@@ -156,11 +156,17 @@ def find_chief_rays(
 
     Arguments are those of `chief_ray_intercepts`.
     """
+    chief = chief_rays(system, points, wavelength)
+    hit = trace_rays(system.opened(), chief)
+    return hit.position[:, :2], chief.converged & hit.valid
+
+
+@torch.no_grad()
+def chief_rays(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> AimedRays:
+    """Return chief rays (N,); arguments are those of `chief_ray_intercepts`."""
     system = system.opened()
     infinite = points.vergence == 0.0
     distance = 1.0 / points.vergence
     finite = torch.where(infinite, torch.ones_like(distance), distance)
     field = torch.where(infinite[:, None], points.slopes.atan(), -points.slopes * finite[:, None])
-    chief = aim(system, field, torch.zeros_like(field), wavelength, distance)
-    hit = trace_rays(system, chief)
-    return hit.position[:, :2], chief.converged & hit.valid
+    return aim(system, field, torch.zeros_like(field), wavelength, distance)

@@ -283,11 +283,12 @@ def relief_efficiencies(
     wavelengths: Sequence[float],
     media: tuple[Medium, Medium],
     blaze: int = 1,
+    tangential: Tensor | None = None,
 ) -> Tensor:
     """Return the share (W, orders) of light that a blazed relief sends into orders of its zones.
 
-    At normal incidence, and zones many wavelengths wide.  Levels and etch errors count; the rest of
-    the light, of a whole sum over orders one, goes into other orders.
+    Zones are many wavelengths wide.  Levels and etch errors count; the rest of the light, of a
+    whole sum over orders one, goes into other orders.
 
     Args:
         relief: of a phase.
@@ -295,6 +296,7 @@ def relief_efficiencies(
         wavelengths: nm.
         media: in front of the surface and behind it.
         blaze: M.
+        tangential: (W,), p of the light, as the module has it; None: normal incidence.
 
     Raises:
         InputError: no design wavelength.
@@ -305,8 +307,12 @@ def relief_efficiencies(
     period = abs(blaze) * design / abs(relief.step(*media, design))
     rows = []
     m = torch.tensor([math.copysign(1, blaze) * order for order in orders], dtype=torch.float64)
-    for wavelength in wavelengths:
-        path = relief.step(*media, wavelength) / wavelength
+    for number, wavelength in enumerate(wavelengths):
+        square = 0.0 if tangential is None else float(tangential[number]) ** 2
+        inside, around = (
+            math.sqrt(max(index**2 - square, 0.0)) for index in relief.indices(*media, wavelength)
+        )
+        path = (inside - around) / wavelength
         if relief.step(*media, design) < 0.0:
             path = -path
         if relief.levels is None:

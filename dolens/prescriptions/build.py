@@ -20,7 +20,7 @@ are negative until the next mirror.  Rows of type `coordinate_break` move and tu
 that stands behind them (see row_data.py).
 A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
 lens (see row_data.py).  Which share of the light passes is said by its `coating` (see coatings.py).
-A plane surface may be a `diffractive` element, whose relief waves see (see diffractive.py).
+A surface may be a `diffractive` element, whose relief waves see (see diffractive.py).
 `thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil

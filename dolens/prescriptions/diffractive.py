@@ -1,7 +1,7 @@
 """Diffractive elements of a prescription, read and written.
 
-A plane surface may be a diffractive element.  Its relief makes the surface's `phase`, is given by
-its heights (nm), or both in sum::
+A surface may be a diffractive element.  Its relief makes the surface's `phase`; on a plane it may
+be given by its heights (nm) as well, or be both in sum::
 
     '1': {type: plane, ..., phase: {type: radial, norm_radius: 2, p2: -5700},
           diffractive: {design_wavelength: 550, levels: 16}}
@@ -52,8 +52,11 @@ def diffractive_from(
     row: Mapping[str, Any] = value  # type: ignore[assignment]
     check_keys(row, _KEYS, where)
     try:
-        if surface.kind not in ("plane", "aperture"):
-            raise InputError(f"a surface of type '{surface.kind}' cannot have one; allowed: plane")
+        if surface.kind not in ("plane", "aperture") and (arrays := set(_ARRAYS) & set(row)):
+            raise InputError(
+                f"a surface of type '{surface.kind}' cannot have '{arrays.pop()}'; allowed on "
+                "it: the 'design_wavelength' of a 'phase' (plane: all)"
+            )
         given = {key: as_number(row[key], f"'{key}'") for key in _NUMBERS if key in row}
         if len([key for key in _ARRAYS if key in row]) > 1:
             raise InputError("give 'pixels' or 'rings', not both")

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.diffraction.element_waves import element_light
+from dolens.diffraction.element_orders import element_flux
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pixel_psf import (
     PixelWindow,
@@ -168,7 +168,7 @@ def wave_point_spread_functions(
     lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
     if system.diffractive:
         # Other orders spread light beyond every window, which nothing gives back.
-        whole = element_light(system, ObjectPoints.at(places[0]), *places[1:]).fit.wavefront.flux
+        whole = element_flux(system, ObjectPoints.at(places[0]), *places[1:])
         whole = whole.reshape(shape).to(total)
         lost = torch.where(whole > 0.0, 1.0 - total / whole, 0.0).detach().max()
         total = whole
