@@ -12,6 +12,8 @@ from torch import Tensor
 SIMILARITY_WINDOW = 11
 # Pixels of all images that are compared at a time: each takes some 700 bytes.
 _PIXELS = 1 << 19
+# RMS of a spectrum whose angle is that of its noise.
+_DARK = 0.02
 
 
 def psnr_db(restored: Tensor, truth: Tensor) -> Tensor:
@@ -30,6 +32,26 @@ def psnr_db(restored: Tensor, truth: Tensor) -> Tensor:
     _check_shapes(restored, truth)
     error = restored.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)
     return -10.0 * error.square().mean(dim=(1, 2, 3)).log10()
+
+
+def spectral_angle(restored: Tensor, truth: Tensor) -> Tensor:
+    """Return the mean angle between spectra of each image, degrees (spectral angle mapper).
+
+    Angles know nothing of brightness.  Pixels whose true spectrum has an RMS below 0.02 count for
+    nothing.
+
+    Args:
+        restored: spectra (B, L, H, W), of white 1; negative values are taken for zero.
+        truth: the same shape.
+
+    Returns:
+        (B,), NaN where all pixels are dark.
+    """
+    restored = restored.clamp(min=0.0)
+    cosine = torch.nn.functional.cosine_similarity(restored, truth, dim=1)
+    lit = truth.square().mean(dim=1).sqrt() > _DARK
+    angle = torch.rad2deg(torch.acos(cosine.clamp(-1.0, 1.0)))
+    return (angle * lit).sum((1, 2)) / lit.sum((1, 2))
 
 
 def structural_similarity(restored: Tensor, truth: Tensor) -> Tensor:

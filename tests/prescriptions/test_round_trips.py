@@ -33,6 +33,9 @@ REFUSED = {
     ("diffractive_doublet", ".zmx"): "surface 5: a .zmx file cannot hold 'diffractive'",
     ("diffractive_doublet", ".txt"): "surface 5: a .txt file cannot hold 'phase'",
     ("diffractive_doublet", ".seq"): "surface 5: a .seq file cannot hold 'phase'",
+    ("spectral_plate", ".zmx"): "surface 3: a .zmx file cannot hold 'diffractive'",
+    ("spectral_plate", ".txt"): "surface 1: a .txt file cannot hold type 'paraxial_lens'",
+    ("spectral_plate", ".seq"): "surface 1: a .seq file cannot hold type 'paraxial_lens'",
     # Plastics are no glass of a maker that these formats know.
     **{
         (name, suffix): f"surface 2: a {suffix} file cannot hold material 'PLASTIC:ZEONEX-E48R'"

@@ -1,0 +1,1 @@
+"""Cameras that take a spectrum at every pixel, in one exposure."""
