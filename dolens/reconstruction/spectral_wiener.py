@@ -33,7 +33,7 @@ _FITTED = 0.02, 0.35
 
 
 class SpectralPrior(NamedTuple):
-    """What is known of scenes before they are imaged.
+    """A prior knows of scenes what their second moments say.
 
     Attributes:
         spectra: G, (L, K), orthonormal.

@@ -14,6 +14,8 @@ from dolens.sensor.colour import linear_to_srgb
 # nm, of the bands that are shown.
 _BANDS = (450.0, 550.0, 650.0)
 _POINTS = 3
+# Pixels at the edges that hold no point.
+_EDGE = 4
 
 
 class Shown(NamedTuple):
@@ -71,16 +73,17 @@ def spectra_figure(shown: Shown) -> Figure:
 
 
 def _points(shown: Shown) -> list[tuple[int, int]]:
-    """Return row and column of pixels of different colours, spread over the scene."""
+    """Return row and column of lit pixels whose colours differ most."""
     rgb = torch.einsum("cl,lhw->chw", shown.colour, shown.truth)
-    lit = rgb.sum(0) > 0.5 * rgb.sum(0).mean()
+    chosen = rgb.sum(0) > 0.5 * rgb.sum(0).mean()
+    for edge in (chosen[:_EDGE], chosen[-_EDGE:], chosen[:, :_EDGE], chosen[:, -_EDGE:]):
+        edge.fill_(False)
+    lit = chosen.flatten()
     share = (rgb / rgb.sum(0).clamp(min=1e-3)).flatten(1).mT
-    # Even patches, so that a point stands for what is around it.
-    even = lit.flatten()
-    found = [int(torch.where(even, share[:, 0], -1.0).argmax())]
+    found = [int(torch.where(lit, share[:, 0], -1.0).argmax())]
     while len(found) < _POINTS:
         far = torch.cdist(share, share[found]).amin(1)
-        found.append(int(torch.where(even, far, -1.0).argmax()))
+        found.append(int(torch.where(lit, far, -1.0).argmax()))
     return [divmod(n, rgb.shape[-1]) for n in found]
 
 
