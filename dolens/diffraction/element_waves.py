@@ -39,11 +39,12 @@ from dolens.diffraction.pupil_fit import (
     fit_pupil,
     regular_pupil,
 )
+from dolens.diffraction.radial_waves import MOST_BEYOND, beyond, by_radius
 from dolens.diffraction.reference_sphere import chief_ray_intercepts
-from dolens.diffraction.wavefront import MM_PER_NM, pupil_wavefront
+from dolens.diffraction.wavefront import MM_PER_NM, coverage, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.diffractive import PhaseOnGrid, Relief, transmission
-from dolens.optics.surfaces.phase import Phase
+from dolens.optics.surfaces.phase import Phase, RadialPhase
 from dolens.optics.surfaces.state import LawState
 from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 
@@ -311,6 +312,48 @@ class ElementLight:
         rows, columns = torch.meshgrid(v + centre[1], u + centre[0], indexing="ij")
         return by_summation(found, layers[0], columns.flatten(), rows.flatten()).reshape(rows.shape)
 
+    def one_radius(self, n: int, half_window: float) -> bool:
+        """Return whether `radial` serves a window about the axis.
+
+        Args:
+            n: number of a point on the axis.
+            half_window: mm, of the square window.
+        """
+        relief, behind = self.relief, self.layers(n)
+        if relief.pixelated or len(behind) > 1 or not self.system.rotationally_symmetric:
+            return False
+        if bool(self.centre[n].any()) or not (self.law is None or self.law.law is RadialPhase):
+            return False
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        edge, reach = float(self.fit.high[n].max()), math.sqrt(2.0) * half_window
+        return beyond(edge, reach, behind[0], wavelength) <= MOST_BEYOND
+
+    def radial(self, n: int, plan: "Plan", rho: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the field (P,) of a point on the axis at distances from it, mm; see `one_radius`.
+
+        Args:
+            n: number of the point.
+            plan: of this point; its cells are the rings' width.
+            rho: (P,), mm.
+            dtype: of the sums.
+        """
+        fit, (layer,) = self.fit, self.layers(n)
+        wavelength = float(fit.wavefront.wavelength[n])
+        r = (torch.arange(plan.count // 2 + 1).to(self.centre) + 0.5) * plan.cell
+        rows = torch.tensor([-plan.cell, 0.0, plan.cell]).to(r)
+        (x, y) = (
+            chebyshev(((at - middle) / half).clamp(-1.0, 1.0)[None], fit.coefficients.shape[-1] - 1)
+            for at, middle, half in zip((r, rows), fit.centre[n], fit.half_width[n], strict=True)
+        )
+        opd, whole, *crossings = (y[0].mT @ fit.coefficients[n] @ x[0]).unbind(0)
+        passed = (r * r <= (fit.radius[n] * fit.half_width[n].max()) ** 2).to(r).expand_as(opd)
+        clipping = fit.wavefront.clipping.values()
+        for surface, u, v in zip(clipping, crossings[::2], crossings[1::2], strict=True):
+            passed = torch.minimum(passed, coverage(surface.aperture, u, v, surface.edge))
+        amplitude, turns = (f[1:2] for f in (whole * passed, opd / (MM_PER_NM * wavelength)))
+        values = self._passed(n, r, rows[1:2], turns, dtype) * amplitude.to(dtype)
+        return by_radius(values[0], r, layer, wavelength, rho)
+
     def behind(self, n: int, plan: "Plan", dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
 
@@ -329,14 +372,6 @@ class ElementLight:
             turns = turns + on_grid(
                 lambda x, y: _turns_to(x, y, layers[0], centre, wavelength), x, y, dtype
             )
-        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
-        inside, around = relief.indices(front, after, wavelength)
-
-        def path(x: Tensor, y: Tensor) -> Tensor:
-            slope_x, slope_y = _slopes(self.fit, n, x, y)
-            square = slope_x.square() + slope_y.square()
-            normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
-            return (next(normal) - next(normal)) / wavelength
 
         def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
             gain = torch.ones((), dtype=torch.float64)
@@ -349,16 +384,38 @@ class ElementLight:
             fill = relief.fill
             return fill * fill * turned(x, y, fill * plan.cell) / turned(x, y)
 
-        phase = None if self.law is None else _phase(self.law, x, y)
         # Of a pixel that is one cell, the part that its height fills turns light further.
         whole = relief.pixelated and plan.cell > 0.99 * relief.pitch and relief.fill < 1.0
         share = on_grid(filled, x, y, dtype) if whole else None
         if relief.pixelated:
             amplitude = amplitude * on_grid(turned, x, y, dtype)
-        length = on_grid(path, x, y, dtype)
+        passed = self._passed(n, x, y, turns, dtype, share)
+        return passed * amplitude.to(dtype), x, y
+
+    def _passed(
+        self,
+        n: int,
+        x: Tensor,
+        y: Tensor,
+        turns: Tensor,
+        dtype: torch.dtype,
+        share: Tensor | None = None,
+    ) -> Tensor:
+        """Return the phasors (Y, X) of light behind the relief that arrives with phases (Y, X)."""
+        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        inside, around = self.relief.indices(front, after, wavelength)
+
+        def path(x: Tensor, y: Tensor) -> Tensor:
+            slope_x, slope_y = _slopes(self.fit, n, x, y)
+            square = slope_x.square() + slope_y.square()
+            normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
+            return (next(normal) - next(normal)) / wavelength
+
+        phase = None if self.law is None else _phase(self.law, x, y)
         turns = (turns - turns.detach().round()).to(dtype)
-        passed = transmission(relief, x, y, length, (front, after), phase, share, turns)
-        return passed.to(dtype.to_complex()) * amplitude.to(dtype), x, y
+        given = on_grid(path, x, y, dtype), (front, after), phase, share, turns
+        return transmission(self.relief, x, y, *given).to(dtype.to_complex())
 
     def _pupil(
         self, n: int, plan: "Plan", carrier: tuple[float, float], dtype: torch.dtype

@@ -121,6 +121,8 @@ _DEGREES, _SHARE = (10, 16), 0.01
 _PIECE = 1 << 24
 # Functions that are evaluated for a pupil: path difference, amplitude, what passes, and crossings.
 _FUNCTIONS = 8
+# Steps along a radius in a period of the irradiance's finest detail.
+_RADIAL_STEPS = 4.0
 
 
 def wave_kernels(
@@ -163,10 +165,12 @@ def wave_kernels(
     """
     settings = settings or DiffractionSettings()
     if system.diffractive:
+        points = _object_points(points)
         if light_goes_by_orders(system):
-            return _by_orders(system, _object_points(points), wavelength, centres, window, settings)
-        light = element_light(system, _object_points(points), wavelength, centres, settings)
-        return _by_element(light, window, system.dtype)
+            return _by_orders(system, points, wavelength, centres, window, settings)
+        light = element_light(system, points, wavelength, centres, settings)
+        axial = (points.slopes == 0.0).all(-1).tolist()
+        return _by_element(light, window, system.dtype, axial)
     if settings.method == "spectrum":
         raise InputError("method spectrum is that of a lens with a diffractive element")
     found = _prepare(system, points, wavelength, centres, window, settings)
@@ -235,17 +239,37 @@ def _element_propagation(light: ElementLight, window: PixelWindow) -> Propagatio
     )
 
 
-def _by_element(light: ElementLight, window: PixelWindow, dtype: torch.dtype) -> Tensor:
-    """Return kernels (N, size, size) of light behind a diffractive element, a point at a time."""
-    plans = [light.plan(n, window.half_width) for n in range(len(light))]
+def _by_element(
+    light: ElementLight, window: PixelWindow, dtype: torch.dtype, axial: Sequence[bool]
+) -> Tensor:
+    """Return kernels (N, size, size) of light behind a diffractive element, a point at a time.
+
+    One radius says all about points on the axis of a round lens, where no method is asked for.
+    """
+    half = window.half_width
+    plans = [light.plan(n, half) for n in range(len(light))]
+    chosen = light.settings.method == "auto"
+    radial = [chosen and on and light.one_radius(n, half) for n, on in enumerate(axial)]
 
     def kernel(i: int, *tensors: Tensor) -> Tensor:
         plan = plans[i]
         count = light.settings.subsamples or math.ceil(plan.band * window.pitch + 2.0)
         pixels = _Subpixels(window, count, dtype)
         x, y = pixels.grid(light.centre)
-        field = light.with_tensors(tensors).field(i, plan, x, y, dtype)
-        return pixels.integrated(field)[..., None]
+        light_now = light.with_tensors(tensors)
+        if radial[i]:
+            step = 1.0 / (_RADIAL_STEPS * plan.band)
+            rho = torch.arange(math.ceil(math.sqrt(2.0) * half / step) + 3).to(x) * step
+            place = torch.hypot(x[None], y[:, None]) / step
+            field = light_now.radial(i, plan, rho, dtype)
+            along = field.real.square() + field.imag.square()
+            # A parabola through the three nearest.
+            near = place.round().clamp(min=1.0)
+            at, off = near.long(), (place - near).to(along)
+            before, there, after = (along[at + k] for k in (-1, 0, 1))
+            bend = 0.5 * off * off * (after - 2.0 * there + before)
+            return pixels.collected(there + 0.5 * off * (after - before) + bend)[..., None]
+        return pixels.integrated(light_now.field(i, plan, x, y, dtype))[..., None]
 
     return replay(kernel, [1] * len(plans), light.tensors).movedim(-1, 0)
 
@@ -311,7 +335,10 @@ class _Subpixels:
 
     def integrated(self, field: Tensor) -> Tensor:
         """(N, size, size): the flux of |field|² in every pixel."""
-        irradiance = field.real.square() + field.imag.square()
+        return self.collected(field.real.square() + field.imag.square())
+
+    def collected(self, irradiance: Tensor) -> Tensor:
+        """(N, size, size): the flux of an irradiance in every pixel."""
         step = self.window.pitch / self.count
         matrix = step * pixel_matrix(self.window.size, self.count, irradiance)
         return matrix @ irradiance @ matrix.mT

@@ -6,7 +6,7 @@ calibration of its distortion.  What the lens does besides is in the functions: 
 colour, and coma's shift.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, NamedTuple
@@ -148,19 +148,23 @@ def wave_point_spread_functions(
     size: int,
     distortion: bool,
     settings: DiffractionSettings | None = None,
+    band: Sequence[float] = (0.0,),
 ) -> FieldPointSpreadFunctions:
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
 
     Each function keeps the share of light that rays give it; what diffraction spreads beyond the
     window is given back in proportion, but for a diffractive element's, whose other orders are lost
-    there.  Arguments as of `field_point_spread_functions`, and how
-    finely diffraction is computed.
+    there.  Arguments as of `field_point_spread_functions`, how finely diffraction is computed, and
+    nm from each of the scene's wavelengths, whose light a function has in equal parts.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
-    places = object_points(imaging, points, _centres(imaging, points, distortion))
+    at, waves, centres = object_points(imaging, points, _centres(imaging, points, distortion))
+    lines = len(band)
+    waves = (waves[:, None] + torch.as_tensor(band).to(waves)).flatten()
+    places = at.repeat_interleave(lines, 0), waves, centres.repeat_interleave(lines, 0)
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
     kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
-    kernels = kernels.reshape(*shape, size, size)
+    kernels = kernels.reshape(*shape, lines, size, size).mean(-3)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _LIGHT_SAMPLES, 0, system)
     seen = plane_points(imaging, points, disc)
     light = seen.weight.sum(-1)
@@ -169,7 +173,7 @@ def wave_point_spread_functions(
     if system.diffractive:
         # Other orders spread light beyond every window, which nothing gives back.
         whole = element_flux(system, ObjectPoints.at(places[0]), *places[1:])
-        whole = whole.reshape(shape).to(total)
+        whole = whole.reshape(*shape, lines).mean(-1).to(total)
         lost = torch.where(whole > 0.0, 1.0 - total / whole, 0.0).detach().max()
         total = whole
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)

@@ -67,6 +67,8 @@ class PsfRenderer(Renderer):
         colours: `each` wavelength has functions of its own, or `one`, the middle, serves all.
         diffraction: `none`: geometric functions; `limit`: these blurred by a perfect pupil's
             diffraction; `wave`: functions of the pupil's wavefront.
+        band: nm from each of the scene's wavelengths, whose light a colour has in equal parts, with
+            diffraction `wave`; (0,) is the scene's wavelength alone.
         pupil: the disc that is sampled; None looks for it at each render, for the lens as it is.
         jitter: draw points in the pupil's strata anew for each seed, or take their centres.
     """
@@ -82,11 +84,13 @@ class PsfRenderer(Renderer):
     jitter: bool = True
     diffraction: Literal["none", "limit", "wave"] = "none"
     pupil: ExitPupil | None = None
+    band: tuple[float, ...] = (0.0,)
 
     model: ClassVar[str] = "psf"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(int(n) for n in self.fields))
+        object.__setattr__(self, "band", tuple(float(n) for n in self.band))
         if self.pupil is not None:
             object.__setattr__(self, "pupil", ExitPupil(*map(float, self.pupil)))
         if len(self.fields) != 2 or min(self.fields) < 1:
@@ -95,6 +99,11 @@ class PsfRenderer(Renderer):
             raise InputError(f"renderer: size must be odd and at least 3, not {self.size}")
         if self.pupil_samples < 1:
             raise InputError("renderer: pupil_samples must be at least 1")
+        if not self.band or (self.diffraction != "wave" and self.band != (0.0,)):
+            raise InputError(
+                f"renderer: band {list(self.band)}; allowed: nm from each wavelength, [0.0] where "
+                "diffraction is not wave"
+            )
         for key, allowed in (
             ("registration", ("chief_rays", "centred", "pinhole")),
             ("illumination", ("map", "functions")),
@@ -250,7 +259,7 @@ class PsfRenderer(Renderer):
         points = points or self.points()
         centred = self.registration != "pinhole"
         if self.diffraction == "wave":
-            return wave_point_spread_functions(imaging, points, self.size, centred)
+            return wave_point_spread_functions(imaging, points, self.size, centred, band=self.band)
         found = field_point_spread_functions(
             imaging,
             points,
@@ -275,7 +284,7 @@ class PsfRenderer(Renderer):
 
     def without_diffraction(self) -> "PsfRenderer":
         """The renderer with geometric functions."""
-        return replace(self, diffraction="none")
+        return replace(self, diffraction="none", band=(0.0,))
 
     def state(self) -> dict[str, Any]:
         """The pupil that it keeps, where it keeps one."""

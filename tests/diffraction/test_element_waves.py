@@ -346,3 +346,43 @@ def test_square_light_is_even_in_single_precision():
     sinc = torch.sinc(0.4 * 0.004 * x / (8 * 550e-6)).square()
     blurred = np.convolve(sinc.numpy(), spline[64 * 62 : 64 * 67].numpy(), mode="same")[31::64]
     assert np.abs(line.numpy() - blurred / blurred.max()).max() < 0.02
+
+
+def pixels(lens, wavelength, position=(0.0, 0.0, -1e5), **settings):
+    window = PixelWindow(0.005, 21)
+    at, settings = torch.tensor([position], dtype=torch.float64), DiffractionSettings(**settings)
+    return wave_kernels(lens.system(), at, wavelength, [[0.0, 0.0]], window, settings)[0]
+
+
+@pytest.mark.parametrize("wavelength", [550.0, 500.0])
+def test_one_radius_says_all_of_a_round_element_on_the_axis(wavelength):
+    # A lens of second order and rings on it, against plane waves of the whole plane.
+    heights = [300.0 * math.sin(0.7 * k) for k in range(40)]
+    lens = kinoform(4.0, 0.3, 2, rings=heights, pitch=0.0075)
+    with torch.no_grad():
+        whole = pixels(lens, wavelength, method="spectrum", samples=900)
+        one = pixels(lens, wavelength, samples=900)
+    assert 0.0 < float((one - whole).abs().max()) < 0.01 * float(whole.max())
+
+
+def test_derivatives_along_one_radius_are_those_of_differences():
+    lens = kinoform(4.0, 0.3, rings=[50.0 * (k % 3) for k in range(20)], pitch=0.015)
+    weight = torch.exp(-0.1 * torch.linspace(-10.0, 10.0, 21, dtype=torch.float64).square())
+
+    def value():
+        return weight @ pixels(lens, 520.0, samples=700) @ weight
+
+    named = {k: p for k, p in lens.named_parameters() if "heights" in k or "sensor_dis" in k}
+    assert len(named) == 2
+    gradients = torch.autograd.grad(value(), list(named.values()))
+    for parameter, gradient in zip(named.values(), gradients, strict=True):
+        along = torch.linspace(0.3, 1.0, parameter.numel(), dtype=torch.float64)
+        along = (0.5 if parameter.numel() > 1 else 1e-4) * along.reshape(parameter.shape)
+        ends = []
+        for sign in (1.0, -1.0):
+            with torch.no_grad():
+                parameter += sign * along
+                ends.append(float(value()))
+                parameter -= sign * along
+        expected = 0.5 * (ends[0] - ends[1])
+        assert float((gradient * along).sum()) == pytest.approx(expected, rel=0.01)

@@ -30,9 +30,11 @@ REFUSED = {
     ("freeform_corrector", ".zmx"): "surface 2: a .zmx file cannot hold type 'b_spline'",
     ("freeform_corrector", ".txt"): "surface 2: a .txt file cannot hold type 'b_spline'",
     ("freeform_corrector", ".seq"): "surface 2: a .seq file cannot hold type 'b_spline'",
-    ("diffractive_doublet", ".zmx"): "surface 5: a .zmx file cannot hold 'diffractive'",
-    ("diffractive_doublet", ".txt"): "surface 5: a .txt file cannot hold 'phase'",
-    ("diffractive_doublet", ".seq"): "surface 5: a .seq file cannot hold 'phase'",
+    **{
+        (name, suffix): f"surface {number}: a {suffix} file cannot hold '{what}'"
+        for name, number in (("diffractive_doublet", 5), ("flat_lens", 2))
+        for suffix, what in ((".zmx", "diffractive"), (".txt", "phase"), (".seq", "phase"))
+    },
     ("spectral_plate", ".zmx"): "surface 3: a .zmx file cannot hold 'diffractive'",
     ("spectral_plate", ".txt"): "surface 1: a .txt file cannot hold type 'paraxial_lens'",
     ("spectral_plate", ".seq"): "surface 1: a .seq file cannot hold type 'paraxial_lens'",

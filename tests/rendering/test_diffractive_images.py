@@ -1,16 +1,21 @@
 """Photographs through diffractive elements: all orders, where rays see the first."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.depths import DepthViews
 from dolens.optics.diffractive import lens_phase
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
+from dolens.sensor.readout import Readout
 
 SENSOR = Sensor(64, 64, 0.004)
 SCENE = PlanarScene(depths=(1000.0,), wavelengths=(550.0,))
@@ -57,6 +62,37 @@ def test_light_of_other_orders_is_lost_to_the_picture_and_levels_have_gradients(
     assert 0.38 < float(binary.mean() / whole.mean()) < 0.47
     (slope,) = torch.autograd.grad(binary.square().mean(), coarse.surfaces["2"].phase.p4)
     assert float(slope) != 0.0
+
+
+def test_a_colour_has_the_light_of_its_band():
+    system = flat_lens().system()
+    renderer = PsfRenderer(SENSOR, (1, 1), size=33, diffraction="wave", band=(-20.0, 10.0))
+    apart = [
+        replace(renderer, band=(0.0,)).point_spread_functions(
+            ImagingSystem.of(system, replace(SCENE, wavelengths=(wavelength,)), SENSOR), 0
+        )
+        for wavelength in (SCENE.wavelengths[0] - 20.0, SCENE.wavelengths[0] + 10.0)
+    ]
+    found = renderer.point_spread_functions(ImagingSystem.of(system, SCENE, SENSOR), 0).functions
+    mean = 0.5 * (apart[0].functions + apart[1].functions)
+    assert torch.allclose(found, mean, atol=1e-3 * float(mean.detach().max()))
+    with pytest.raises(InputError, match=r"band .*diffraction is not wave"):
+        replace(renderer, diffraction="none")
+
+
+def test_a_network_is_told_waves_where_asked():
+    lens = flat_lens(torch.float32, levels=2)
+    renderer = PsfRenderer(SENSOR, (1, 1), size=33, diffraction="wave", band=(-20.0, 10.0))
+    scene = replace(SCENE, wavelengths=(600.0, 550.0, 500.0))
+    given = scene, renderer, Readout.at_light(100.0, 8000.0, read_noise=0.0004)
+    told, rays = (
+        DepthViews(*given, psf_size=33, psf_diffraction=how).point_spread_functions(lens)
+        for how in ("wave", "none")
+    )
+    shown = renderer.point_spread_functions(ImagingSystem.of(lens.system(), scene, SENSOR), 0)
+    assert torch.allclose(told, shown.functions[0], atol=1e-3 * float(told.max()))
+    # Rays know one order of an element of two levels, and all light in it.
+    assert float(told[0, 1].sum()) < 0.5 < 0.9 < float(rays[0, 1].sum())
 
 
 def test_rays_do_not_show_heights_alone():

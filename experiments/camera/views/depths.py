@@ -35,6 +35,7 @@ from dolens.experiments.camera.views.whole import (
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.exit_pupil import axial_f_number
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
@@ -64,8 +65,10 @@ class DepthViews(Imaging):
         truth: `pinhole` or `chief_rays`.
         seed: of rendering and noise.
         reference_renderers: make the test images besides, of the same sensor, by name.
-        psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
-            perfect pupil's diffraction, as a measurement would find them.
+        psf_diffraction: of the functions that networks ask for: `none`; `limit`: blurred by a
+            perfect pupil's diffraction, as a measurement would find them; `wave`: of wavefronts, at
+            the middle of the sensor, with the `band` of the training renderer.  Rays do not see a
+            diffractive element's heights and other orders.
         psf_depths: of the functions that networks ask for, mm; None: the scene's.  A camera that is
             calibrated at its own depths is judged at others by it.
         lights: are added to all images, those of tests too; None: none.
@@ -105,7 +108,7 @@ class DepthViews(Imaging):
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self._reference_renderers = dict(reference_renderers or {})
-        check_choice(psf_diffraction, ("none", "limit"), "views.psf_diffraction")
+        check_choice(psf_diffraction, ("none", "limit", "wave"), "views.psf_diffraction")
         self.psf_diffraction = psf_diffraction
         self._f_number: float | None = None
         others = {
@@ -132,7 +135,7 @@ class DepthViews(Imaging):
         super().expose(lens)
         if self.lights is not None:
             self.lights.begin(lens, self.scene, self.sensor)
-        if self.psf_diffraction != "none":
+        if self.psf_diffraction == "limit":
             self._f_number = axial_f_number(lens)
 
     @property
@@ -200,6 +203,18 @@ class DepthViews(Imaging):
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
         scene = self._psf_scene(depths)
+        if self.psf_diffraction == "wave":
+            renderer = PsfRenderer(
+                self.sensor,
+                (1, 1),
+                samples,
+                size or self.psf_size,
+                registration="centred" if self.registers_moved_images else "pinhole",
+                diffraction="wave",
+                band=getattr(self.renderer, "band", (0.0,)),
+            )
+            imaging = ImagingSystem.of(lens.system(), scene, self.sensor)
+            return renderer.point_spread_functions(imaging, 0).functions[0]
         functions = axial_point_spread_functions(
             lens,
             scene,
