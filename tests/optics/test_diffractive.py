@@ -202,8 +202,8 @@ def test_what_makes_no_element_is_refused_in_one_line(element, said):
     assert "\n" not in str(error.value)
 
 
-def test_only_planes_are_diffractive():
-    with pytest.raises(InputError, match="type 'sphere' cannot have one; allowed: plane"):
+def test_only_planes_have_heights():
+    with pytest.raises(InputError, match="type 'sphere' cannot have 'rings'; allowed on it: the"):
         lens_from_prescription(prescription({"rings": [1], "pitch": 1}, type="sphere", radius=9))
 
 
