@@ -161,11 +161,11 @@ def _tangential(
 
 def even_irradiance(
     order: Order, points: ObjectPoints, wavelengths: Tensor, centres: Tensor, half_window: float
-) -> Tensor:
-    """Return the irradiance (N,), 1/mm², of an order that is far out of focus about centres (N, 2),
-    mm, with the flux of an axial point as unit; NaN where it is not even in a window.
+) -> tuple[Tensor, Tensor]:
+    """Return the irradiance (N,), 1/mm², of an order that is out of focus about centres (N, 2), mm,
+    with the flux of an axial point as unit, and whether it is even in a window, (N,), bool.
 
-    It is that of the nearest tenth of its rays, where these fill a disc twice as wide as a window.
+    It is that of the nearest tenth of its rays, which fill a disc twice as wide as an even window.
     """
     front = pupil_wavefront(order.system, points, wavelengths, centres, _RAYS, math.inf)
     light = (front.amplitude * front.weight).flatten(1)
@@ -175,11 +175,11 @@ def even_irradiance(
     last = (within.detach() < _DISC * flux.detach()[:, None]).sum(1, keepdim=True)
     last = last.clamp(max=light.shape[1] - 1)
     square = distance.gather(1, last)[:, 0]
-    wide = square.detach() > (2.0 * half_window) ** 2
     # The last ray lies on the disc's edge, and half of it counts.
     inside = (within - 0.5 * light).gather(1, last)[:, 0]
-    found = inside / (math.pi * torch.where(wide, square, 1.0))
-    return order.share * torch.where(wide | (flux == 0.0), found, math.nan)
+    far = square.detach() > (2.0 * half_window) ** 2
+    square = torch.where(square > 0.0, square, math.inf)
+    return order.share * inside / (math.pi * square), far | (flux == 0.0)
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,8 @@ class OrdersSpread:
 
     def _even(self, k: int, half: float) -> float | None:
         """Return the irradiance, 1/mm², of an order that is even in a window; else None."""
-        found = even_irradiance(self.orders[k], self.points, self.wavelengths, self.centre, half)
-        if bool(found.isnan().any()):
+        order, light = self.orders[k], (self.points, self.wavelengths)
+        found, even = even_irradiance(order, *light, self.centre, half)
+        if not bool(even.all()):
             return None
         return float(self.weights @ found / (self.weights @ self.flux))

@@ -20,6 +20,7 @@ from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.propagation import (
     DiffractionSettings,
     Propagation,
+    TooSteepError,
     choose_propagation,
     direct_field,
     direct_samples,
@@ -290,17 +291,35 @@ def _by_orders(
         centres = chief_ray_intercepts(system, points, waves)
     centre = torch.as_tensor(centres).to(points.slopes)
     total = torch.zeros((len(points), window.size, window.size)).to(points.slopes)
-    for order in orders_of(system, points, waves):
-        even = even_irradiance(order, points, waves, centre, window.half_width)
-        sharp = even.isnan().nonzero().flatten()
-        flat = torch.where(even.isnan(), 0.0, even)
-        total = total + (flat * window.pitch**2)[:, None, None]
+    for place, order in enumerate(orders_of(system, points, waves)):
+        light, even = even_irradiance(order, points, waves, centre, window.half_width)
+        sharp = (~even).nonzero().flatten()
+        if place and len(sharp):
+            # Direct integration takes too long for some per cent of the light.
+            sharp = sharp[_by_transform(order.system, points, waves, centre, sharp, window)]
+        even = torch.ones_like(even).index_fill(0, sharp, False)
+        total = total + (torch.where(even, light, 0.0) * window.pitch**2)[:, None, None]
         if len(sharp):
             kernels = wave_kernels(
                 order.system, points[sharp], waves[sharp], centre[sharp], window, settings
             )
             total = total.index_add(0, sharp, order.share[sharp, None, None] * kernels)
     return total.to(dtype)
+
+
+def _by_transform(
+    system: OpticalSystem,
+    points: ObjectPoints,
+    waves: Tensor,
+    centre: Tensor,
+    which: Tensor,
+    window: PixelWindow,
+) -> Tensor:
+    """Return whether a Fourier transform holds for some of the points (K,), bool."""
+    try:
+        return propagation(system, points[which], waves[which], centre[which], window).fourier
+    except TooSteepError:
+        return torch.zeros_like(which, dtype=torch.bool)
 
 
 @dataclass(frozen=True)
