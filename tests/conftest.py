@@ -14,6 +14,7 @@ import torch
 import yaml
 
 from dolens import Lens, load_lens
+from dolens.files import user_cache_folder
 from dolens.prescriptions import lens_from_prescription
 from tests.browser import chromium, page, run_async
 
@@ -22,6 +23,8 @@ __all__ = ["chromium", "page", "run_async"]
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(2, os.cpu_count() or 1))
+# Tests give commands homes of their own: each would compile all kernels again, for seconds.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache_folder()))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -34,8 +37,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """The garbage collector never looks at the modules and tests, which stay to the end."""
+    """The garbage collector never looks at the modules and tests, which stay to the end.
+
+    Numba asks what the processor has when the first function is decorated.  That is among the
+    imports, where kernels would be compiled for narrower vectors than in a user's process: each of
+    them once for the tests, and again for the processes that they start.
+    """
     gc.disable()
+    from numba.core.registry import cpu_target
+
+    from dolens.kernels.cpu import compiler
+
+    with compiler._wide_vectors():
+        cpu_target.target_context  # noqa: B018
     try:
         return (yield)
     finally:

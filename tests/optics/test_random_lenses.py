@@ -44,7 +44,7 @@ def test_backends_agree_on_any_prescription(number):
             assert not broken, found
 
 
-@pytest.mark.parametrize("number", range(30))
+@pytest.mark.parametrize("number", range(12))
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_directions_stay_unit_vectors_and_light_returns_the_way_it_came(backend, number):
     """But where a small shift moves light far: near a tangent rounding has no bound."""

@@ -131,7 +131,6 @@ def test_a_feature_pyramid_takes_multiples_of_its_backbone_s_stride(tmp_path):
     found = exportable(camera_of(network))
     assert found.multiple == 4 and found.size == (24, 20)
     assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
-    assert export_torch(found, tmp_path / "network.pt2").facts["largest_error"] < 1e-6
 
 
 def test_a_network_of_one_s_own_takes_one_size_or_the_multiple_that_is_given(tmp_path):
