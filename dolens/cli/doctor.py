@@ -19,6 +19,7 @@ EXTRAS = {
     "onnx": "ONNX files by dolens export",
     "edges": "loss.perceptual=vgg16_edges",
     "bm3d": "network=wiener_bm3d; not for commercial use",
+    "spectra": "experiment=snapshot_spectra",
     "mlflow": "logger=mlflow",
     "wandb": "logger=wandb",
     "live": "dolens play, dolens watch, train live=true",

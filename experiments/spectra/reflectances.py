@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
 from dolens.experiments.data.camera_data import Split
+from dolens.experiments.loggers.protocol import require_package
 
 # 31 bands, nm.
 BANDS = tuple(float(w) for w in range(400, 701, 10))
@@ -49,14 +49,11 @@ def reflectances() -> Reflectances:
     Raises:
         InputError: colour-science is not installed.
     """
-    try:
-        import colour
-        from colour.quality.cfi2017 import load_TCS_CIE2017
-        from colour.quality.datasets import SDS_TCS, SDS_VS
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "measured spectra come from the package colour-science; pip install dolens[spectra]"
-        ) from error
+    require_package("colour", "spectra", "measured spectra")
+    import colour
+    from colour.quality.cfi2017 import load_TCS_CIE2017
+    from colour.quality.datasets import SDS_TCS, SDS_VS
+
     shape = colour.SpectralShape(BANDS[0], BANDS[-1], BANDS[1] - BANDS[0])
 
     def bands(distribution: object) -> Tensor:
