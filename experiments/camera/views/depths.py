@@ -67,7 +67,7 @@ class DepthViews(Imaging):
         reference_renderers: make the test images besides, of the same sensor, by name.
         psf_diffraction: of the functions that networks ask for: `none`; `limit`: blurred by a
             perfect pupil's diffraction, as a measurement would find them; `wave`: of wavefronts, at
-            the middle of the sensor, with the `band` of the training renderer.  Rays do not see a
+            the middle of the sensor, with the `band` of the evaluation's.  Rays do not see a
             diffractive element's heights and other orders.
         psf_depths: of the functions that networks ask for, mm; None: the scene's.  A camera that is
             calibrated at its own depths is judged at others by it.
@@ -211,7 +211,7 @@ class DepthViews(Imaging):
                 size or self.psf_size,
                 registration="centred" if self.registers_moved_images else "pinhole",
                 diffraction="wave",
-                band=getattr(self.renderer, "band", (0.0,)),
+                band=getattr(self.evaluation_renderer, "band", (0.0,)),
             )
             imaging = ImagingSystem.of(lens.system(), scene, self.sensor)
             return renderer.point_spread_functions(imaging, 0).functions[0]
