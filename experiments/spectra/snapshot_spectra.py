@@ -136,11 +136,14 @@ class SnapshotSpectraModule(Experiment):
             raise InputError(f"sampling.psf_size: {sampling.psf_size}; allowed: odd numbers")
         self.learning, self.sampling, self.readout = learning, sampling, readout
         self.patterns = {LEARNED: pattern, **{n: r.pattern for n, r in rivals.items()}}
-        for name, found in self.patterns.items():
-            if found is not None:
-                check_choice(found, PATTERNS, f"pattern of {name}")
+        for name, filters in self.patterns.items():
+            if filters is not None:
+                check_choice(filters, PATTERNS, f"pattern of {name}")
         self.shown, self.seed = shown, seed
-        self.relief = lens.variables([learning.relief])[learning.relief]
+        found = lens.variables([learning.relief])
+        if [*found] != [learning.relief]:
+            raise InputError(f"learning.relief: {learning.relief}; allowed: one parameter's name")
+        self.relief = found[learning.relief]
         with torch.no_grad():
             noise = torch.randn(self.relief.shape, generator=generator_of(seed))
             self.relief.add_(learning.scatter * noise.to(self.relief))
@@ -168,6 +171,8 @@ class SnapshotSpectraModule(Experiment):
         if self.prior is not None:
             return
         data, sampling = self.trainer.datamodule, self.sampling
+        if any(length % 2 for length in data.crop_size):
+            raise InputError(f"data.crop_size: {list(data.crop_size)}; allowed: even numbers")
         photographs = data.photographs("train")
         crops = EvaluationCrops(
             photographs, data.item_size, sampling.prior_crops, data.evaluation_scale
