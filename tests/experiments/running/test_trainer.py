@@ -26,6 +26,7 @@ from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 from tests.experiments.camera.test_field_views import LINES, WHOLE, doublet
 from tests.experiments.camera.test_own_reconstruction import CONVOLUTION
+from tests.experiments.conftest import finished_run
 from tests.experiments.runs import Finished
 from tests.experiments.tiny_experiment import (
     CAMERA,
@@ -68,8 +69,17 @@ def agree(one, other, tolerance=1e-5):
 
 
 @pytest.fixture(scope="module")
-def two(root, tmp_path_factory) -> Finished:
-    """The folder of a run by two processes, which start as a user starts them."""
+def one(root, tmp_path_factory) -> Finished:
+    """The folder of a run by this process."""
+    return Finished(finished_run(root, tmp_path_factory.mktemp("process"), *SHARED, name="one"))
+
+
+@pytest.fixture(scope="module")
+def two(root, tmp_path_factory, one) -> Finished:
+    """The folder of a run by two processes, which start as a user starts them.
+
+    Behind that of one, whose kernels both read from disk: each would compile them all.
+    """
     folder = tmp_path_factory.mktemp("processes") / "two"
     settings = [*SHARED, "trainer.devices=2", f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -86,8 +96,7 @@ def two(root, tmp_path_factory) -> Finished:
     return Finished(folder)
 
 
-def test_two_processes_train_and_test_as_one(trained, two):
-    one = trained(*SHARED, folder="one")
+def test_two_processes_train_and_test_as_one(trained, one, two):
     # Sums in another order, in single precision.
     assert agree(one.state, two.state)
     assert one.metrics.keys() == two.metrics.keys()
