@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-pytest.importorskip("colour")
-
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_module
 from dolens.experiments.spectra import snapshot_spectra
