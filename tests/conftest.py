@@ -37,19 +37,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """The garbage collector never looks at the modules and tests, which stay to the end.
-
-    Numba asks what the processor has when the first function is decorated.  That is among the
-    imports, where kernels would be compiled for narrower vectors than in a user's process: each of
-    them once for the tests, and again for the processes that they start.
-    """
+    """The garbage collector never looks at the modules and tests, which stay to the end."""
     gc.disable()
-    from numba.core.registry import cpu_target
-
-    from dolens.kernels.cpu import compiler
-
-    with compiler._wide_vectors():
-        cpu_target.target_context  # noqa: B018
     try:
         return (yield)
     finally:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
-from numba.core import config, event
+from numba.core import config, event, registry
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
@@ -284,6 +284,11 @@ def _wide_vectors() -> Iterator[None]:
         config.CPU_FEATURES = None
 
 
+# Numba reads it when the first function is decorated, too, as some are on import.
+with _wide_vectors():
+    registry.cpu_target.target_context  # noqa: B018
+
+
 @contextmanager
 def _unrolled(longest: int) -> Iterator[None]:
     """Let LLVM unroll the loops over a shape's series, and not that over a block's 128 rays.
@@ -295,8 +300,8 @@ def _unrolled(longest: int) -> Iterator[None]:
     Args:
         longest: numbers of the longest series.
     """
-    if longest < BLOCK:
-        _set_limits(100_000, BLOCK - 1)
+    if longest <= BLOCK - _PEELED:
+        _set_limits(100_000, BLOCK - _PEELED)
     else:
         _set_limits(40_000, _ANY)
     try:
@@ -306,6 +311,8 @@ def _unrolled(longest: int) -> Iterator[None]:
 
 
 _ANY = 2**32 - 1
+# LLVM may take some of a block's rays out of the loop; what is left of it is to stay a loop.
+_PEELED = 8
 
 
 def _set_limits(threshold: int, steps: int) -> None:

@@ -1,7 +1,7 @@
 """A shape's functions are compiled for a precision, and inlined in the loop over a block's rays.
 
 Numba inlines them, before LLVM sees them: the loops over a series, whose length is then a constant,
-are unrolled (up to 127 numbers), and the loop over rays is vectorised.
+are unrolled (up to 120 numbers), and the loop over rays is vectorised.
 """
 
 from collections.abc import Callable, Sequence
