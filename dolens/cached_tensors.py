@@ -1,6 +1,7 @@
 """Tensors that a process keeps serve every later call, with and without gradients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache, wraps
 from typing import ParamSpec, TypeVar
 
@@ -9,6 +10,14 @@ from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+@contextmanager
+def to_be_kept() -> Iterator[None]:
+    """Make tensors that may be kept, as `cached_tensors` says why."""
+    transforms = temporarily_clear_interpreter_stack()
+    with transforms, torch.inference_mode(False), torch.no_grad():
+        yield
 
 
 def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -27,8 +36,7 @@ def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Cal
         @lru_cache(maxsize=maxsize)
         @wraps(function)
         def kept(*args: P.args, **options: P.kwargs) -> R:
-            transforms = temporarily_clear_interpreter_stack()
-            with transforms, torch.inference_mode(False), torch.no_grad():
+            with to_be_kept():
                 return function(*args, **options)
 
         return kept  # type: ignore[return-value]  # a wrapper takes what the function takes

@@ -27,7 +27,7 @@ from dolens.errors import InputError
 from dolens.optics.diffractive import relief_efficiencies
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.ray_tracing import trace_rays
-from dolens.optics.rays import Components
+from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 
 # Orders on either side of rays' own that are looked at, and the least share of one that is carried.
@@ -102,16 +102,16 @@ def orders_of(system: OpticalSystem, points: ObjectPoints, wavelengths: Tensor) 
         InputError: a chief ray does not reach an element.
     """
     orders, shares = [], []
+    chief = chief_rays(system, points, wavelengths)
     for number in system.diffractive:
         surface = system.surfaces[number - 1]
         assert surface.deflection is not None and surface.relief is not None
         blaze = round(float(surface.deflection.parameters["order"]))
         sign = 1 if blaze > 0 else -1
-        # Where M is high another wavelength has its light in an order far from M.
-        reach = _AROUND + abs(blaze)
-        found = range(min(0, abs(blaze) - _AROUND), abs(blaze) + reach + 1)
+        # Where M is high another wavelength has its light in an order far from M, up to 2M.
+        found = range(min(0, abs(blaze) - _AROUND), 2 * abs(blaze) + _AROUND + 1)
         media = system.materials[number - 1], system.materials[number]
-        tangential = _tangential(system, number, points, wavelengths)
+        tangential = _tangential(system, number, chief, wavelengths)
         orders.append([sign * m for m in found])
         shares.append(
             relief_efficiencies(
@@ -142,12 +142,9 @@ def _bent(system: OpticalSystem, numbers: tuple[int, ...]) -> OpticalSystem:
     return replace(system, surfaces=surfaces)
 
 
-def _tangential(
-    system: OpticalSystem, number: int, points: ObjectPoints, wavelengths: Tensor
-) -> Tensor:
+def _tangential(system: OpticalSystem, number: int, chief: Rays, wavelengths: Tensor) -> Tensor:
     """Return n·sin of the angle at which chief rays meet a surface, (N,)."""
     opened = system.opened()
-    chief = chief_rays(system, points, wavelengths)
     before = chief if number == 1 else trace_rays(opened, chief, last=number - 1)
     hit = trace_rays(opened, chief, last=number)
     ray = Components(*hit.position.unbind(-1), *before.direction.unbind(-1))
@@ -268,6 +265,10 @@ class OrdersSpread:
     def _pupils(self) -> dict[int, FieldPupil]:
         return {}
 
+    @cached_property
+    def _evens(self) -> dict[tuple[int, float], float | None]:
+        return {}
+
     def _pupil(self, k: int) -> FieldPupil:
         """Return the pupils of an order."""
         if k not in self._pupils:
@@ -280,8 +281,9 @@ class OrdersSpread:
 
     def _even(self, k: int, half: float) -> float | None:
         """Return the irradiance, 1/mm², of an order that is even in a window; else None."""
-        order, light = self.orders[k], (self.points, self.wavelengths)
-        found, even = even_irradiance(order, *light, self.centre, half)
-        if not bool(even.all()):
-            return None
-        return float(self.weights @ found / (self.weights @ self.flux))
+        if (k, half) not in self._evens:
+            order, light = self.orders[k], (self.points, self.wavelengths)
+            found, even = even_irradiance(order, *light, self.centre, half)
+            mean = float(self.weights @ found / (self.weights @ self.flux))
+            self._evens[k, half] = mean if bool(even.all()) else None
+        return self._evens[k, half]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.cached_tensors import cached_tensors
+from dolens.cached_tensors import cached_tensors, to_be_kept
 from dolens.kernels import operators
 from dolens.kernels.operators import are_plain, is_eager, kernels_of
 from dolens.kernels.table import LossTable, SurfaceTable
@@ -226,8 +226,7 @@ def eager_indices(found: LaidOut, wavelength: float | Tensor) -> Tensor:
     if known is None:
         if len(found.indices) >= _WAVELENGTHS:
             found.indices.clear()
-        # A tensor made in inference mode could never be saved for a backward pass.
-        with torch.inference_mode(False):
+        with to_be_kept():
             known = record_indices(found, wavelength, found.scalars[0].device)
         found.indices[wavelength] = known
     return known

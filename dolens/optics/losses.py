@@ -8,6 +8,7 @@ on from them to whatever a coating is made of.
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dolens.cached_tensors import cached_tensors
+from dolens.cached_tensors import cached_tensors, to_be_kept
 from dolens.errors import InputError
 from dolens.kernels.table import POWERS, Code, Cosine, Failure, Kind, LossTable, Slot
 from dolens.optics.coatings import CoatingState
@@ -306,7 +307,7 @@ def loss_table_of(
     key = (wavelengths, values)
     if stays and key in kept:
         return kept[key]
-    with torch.inference_mode(False):  # such a table could never be saved for a backward pass
+    with to_be_kept() if stays else nullcontext():
         waves = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
         losses = losses_of(system, waves, sense, 1e-12 if system.dtype == torch.float64 else 1e-7)
         table = None

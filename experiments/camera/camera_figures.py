@@ -110,8 +110,9 @@ def _whole_functions(camera: Camera) -> Tensor:
     """Return point spread functions in a window that cuts next to nothing off."""
     lens, views = camera.lens.with_values(camera.variables()), camera.views
     found = views.point_spread_functions(lens, _PUPIL_SAMPLES)
-    # A diffractive element's other orders fill no window.
-    while getattr(views, "psf_diffraction", "none") != "wave":
+    if getattr(views, "psf_diffraction", "none") == "wave":
+        return found  # a diffractive element's other orders fill no window
+    while True:
         size = 2 * found.shape[-1] - 1
         if size > _LARGEST_WINDOW:
             return found
@@ -120,7 +121,6 @@ def _whole_functions(camera: Camera) -> Tensor:
         if bool(held.all()):
             return found
         found = wider
-    return found
 
 
 def _layout(camera: Camera) -> Figure:

@@ -319,6 +319,24 @@ def test_the_share_follows_a_film_that_changes_in_place():
     assert (fast - found).abs().max() < 1e-9
 
 
+def test_what_is_kept_of_losses_serves_gradients_later():
+    """A lens that was judged in inference mode, or within a transform, is trained afterwards."""
+    lens = lens_from_prescription(COATED | {"coating": "none"})
+    lens.backend = "cpu"
+    rays = bundle(lens, 80)
+
+    def passed():
+        return lens.trace(rays, transmission=True).transmission.nansum()
+
+    with torch.inference_mode():
+        first = passed()
+    again = passed()
+    again.backward()
+    assert lens.surfaces["1"].curvature.grad.abs() > 0.0
+    assert torch.func.grad(lambda x: x * passed().detach())(torch.ones((), dtype=F64)) == again
+    assert first.item() == again.item()
+
+
 def test_coatings_and_glasses_as_series_lose_what_they_lose():
     """Values and the derivatives with respect to curvatures and the layers' thicknesses."""
     lens = lens_from_prescription(COATED)
