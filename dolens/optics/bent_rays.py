@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from dolens.kernels.operators import is_eager
 from dolens.optics.autograd import is_transformed
+from dolens.optics.bent_motion import Motion, carry
 from dolens.optics.elements import (
     Axes,
     from_lens_axes,
@@ -23,7 +24,7 @@ from dolens.optics.elements import (
     points_to_lens_axes,
     to_lens_axes,
 )
-from dolens.optics.gradients import Bend, Gradient, Motion, Number, carry
+from dolens.optics.gradients import TERMS, Bend, Number, Profile
 from dolens.optics.rays import Components
 
 # Newton's steps towards the next surface, and the share of a path's steps that all but the first
@@ -37,50 +38,76 @@ _LEAST, _LARGEST = 1e-6, 1e4
 _FEW = 1024
 
 
+@dataclass(frozen=True)
+class Form:
+    """A profile without its numbers.
+
+    Attributes:
+        terms: as in `Profile`.
+        squared: likewise.
+    """
+
+    terms: tuple[str, ...]
+    squared: bool
+
+    def profile(self, coefficients: Tensor) -> Profile:
+        """Return the profile with these coefficients of all `TERMS`, (14,)."""
+        values = tuple(coefficients[TERMS.index(term)] for term in self.terms)
+        return Profile(self.terms, values, self.squared)
+
+
 class _Carry(torch.autograd.Function):
-    """Rays are carried through a gradient by the CPU's kernel; first derivatives only."""
+    """Rays are carried through a gradient by the CPU's kernel; first derivatives only.
+
+    Coefficients (14,) are those of all `TERMS`; `form` has the names of the profile's own, and
+    whether the terms add to n².
+    """
 
     @staticmethod
-    def forward(motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int) -> Tensor:
+    def forward(
+        motion: Tensor, t: Tensor, base: Tensor, coefficients: Tensor, form: Form, steps: int
+    ) -> Tensor:
         """Carry (7, N)."""
-        given = (medium.coefficients, medium.squared, steps)
+        given = (coefficients, form.squared, steps)
         end: Tensor = _kernels().carry(motion.clone(), t, base, *given)
         return end
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         """Keep both ends."""
-        motion, t, base, ctx.medium, ctx.steps = inputs
-        ctx.save_for_backward(motion, output, t, base)
-        ctx.save_for_forward(motion, output, t, base)
+        motion, t, base, coefficients, ctx.form, ctx.steps = inputs
+        ctx.save_for_backward(motion, output, t, base, coefficients)
+        ctx.save_for_forward(motion, output, t, base, coefficients)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         """Take cotangents back to the beginning."""
-        motion, end, t, base = ctx.saved_tensors
-        medium = ctx.medium
-        if not is_eager([cotangent, motion, t, base]):
-            return _by_operations(motion, t, base, medium, ctx.steps, cotangent)
-        of_motion, of_base = _kernels().carry_adjoint(
+        motion, end, t, base, coefficients = ctx.saved_tensors
+        if not is_eager([cotangent, motion, t, base, coefficients]):
+            return _by_operations(motion, t, base, coefficients, ctx.form, ctx.steps, cotangent)
+        of_motion, of_base, of_coefficients = _kernels().carry_adjoint(
             *(end, cotangent.contiguous().clone(), t, base),
-            *(medium.coefficients, medium.squared, ctx.steps),
+            *(coefficients, ctx.form.squared, ctx.steps, ctx.needs_input_grad[3]),
         )
-        return of_motion, None, of_base if base.numel() > 1 else of_base.sum(0, True), None, None
+        of_base = of_base if base.numel() > 1 else of_base.sum(0, True)
+        return of_motion, None, of_base, of_coefficients, None, None
 
     @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, _: Any, of_base: Tensor | None, *__: Any) -> Any:
+    def jvp(
+        ctx: Any, tangent: Tensor, _: Any, of_base: Tensor | None, of_own: Tensor | None, *__: Any
+    ) -> Any:
         """Carry tangents along; t has none."""
-        motion, _, t, base = ctx.saved_tensors
+        motion, _, t, base, coefficients = ctx.saved_tensors
         of_base = torch.zeros_like(base) if of_base is None else of_base
-        return _CarryTangent.apply(motion, t, base, tangent, of_base, ctx.medium, ctx.steps)
+        of_own = torch.zeros_like(coefficients) if of_own is None else of_own
+        given = (motion, t, base, tangent, of_base, coefficients, of_own)
+        return _CarryTangent.apply(*given, ctx.form, ctx.steps)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        """Carry the rays of many lenses as those of one."""
-        *tensors, medium, steps = args
-        folded = _folded(info.batch_size, in_dims[:3], tensors)
-        return _unfolded(_Carry.apply(*folded, medium, steps), info.batch_size), 1
+        """Carry the rays of many lenses as those of one, or lens by lens where profiles differ."""
+        return _batched(_Carry.apply, info.batch_size, in_dims, args, 3)
 
 
 class _CarryTangent(torch.autograd.Function):
@@ -93,12 +120,14 @@ class _CarryTangent(torch.autograd.Function):
         base: Tensor,
         tangent: Tensor,
         of_base: Tensor,
-        medium: Gradient,
+        coefficients: Tensor,
+        of_coefficients: Tensor,
+        form: Form,
         steps: int,
     ) -> Tensor:
         """Carry (7, N)."""
-        given = (medium.coefficients, medium.squared, steps)
         tangents = tangent.contiguous().clone(), t, base, of_base.contiguous()
+        given = (coefficients, of_coefficients, form.squared, steps)
         found: Tensor = _kernels().carry_tangent(motion, *tangents, *given)
         return found
 
@@ -108,25 +137,59 @@ class _CarryTangent(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        """Carry many tangents as those of as many rays."""
-        *tensors, medium, steps = args
-        folded = _folded(info.batch_size, in_dims[:5], tensors)
-        return _unfolded(_CarryTangent.apply(*folded, medium, steps), info.batch_size), 1
+        """Carry many tangents as those of as many rays, or one by one where profiles differ."""
+        return _batched(_CarryTangent.apply, info.batch_size, in_dims, args, 5)
 
 
 def _by_operations(
-    motion: Tensor, t: Tensor, base: Tensor, medium: Gradient, steps: int, cotangent: Tensor
+    motion: Tensor,
+    t: Tensor,
+    base: Tensor,
+    coefficients: Tensor,
+    form: Form,
+    steps: int,
+    cotangent: Tensor,
 ) -> tuple[Tensor | None, ...]:
     """Return the cotangents of `_Carry` through PyTorch's operations, which all can follow."""
     with torch.enable_grad():
-        motion, base = (part.detach().requires_grad_() for part in (motion, base))
+        given = motion, base, coefficients
+        motion, base, coefficients = (part.detach().requires_grad_() for part in given)
+        profile = form.profile(coefficients)
         begin = Motion(*motion.unbind())
-        end = torch.stack(carry(lambda *point: medium.bend(base, *point), begin, t, steps))
-        of_motion, of_base = torch.autograd.grad(end, (motion, base), cotangent)
-    return of_motion, None, of_base, None, None
+        end = torch.stack(carry(lambda *point: profile.bend(base, *point), begin, t, steps))
+        found = torch.autograd.grad(end, (motion, base, coefficients), cotangent)
+    of_motion, of_base, of_coefficients = found
+    return of_motion, None, of_base, of_coefficients, None, None
 
 
-def _folded(size: int, dims: tuple[Any, ...], tensors: list[Tensor]) -> list[Tensor]:
+def _batched(
+    apply: Callable[..., Tensor],
+    size: int,
+    dims: tuple[Any, ...],
+    args: tuple[Any, ...],
+    of_rays: int,
+) -> tuple[Tensor, int]:
+    """Carry a batch of B lenses or tangents.
+
+    Args:
+        apply: carries those of one.
+        size: B.
+        dims: of the batch in each argument, or None.
+        args: `of_rays` tensors with a last dimension of rays, then those of profiles, then others.
+        of_rays: how many.
+    """
+    if all(dim is None for dim in dims[of_rays:]):
+        folded = _folded(size, dims[:of_rays], args[:of_rays])
+        end = apply(*folded, *args[of_rays:])
+        return end.reshape(len(end), size, -1), 1
+    own = [
+        [arg] * size if dim is None else arg.movedim(dim, 0).unbind()
+        for arg, dim in zip(args, dims, strict=True)
+    ]
+    return torch.stack([apply(*each) for each in zip(*own, strict=True)]), 0
+
+
+def _folded(size: int, dims: tuple[Any, ...], tensors: tuple[Tensor, ...]) -> list[Tensor]:
     """Return (7, B·N) and (B·N,) of tensors with or without a dimension of a batch of B."""
     batches = [
         tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
@@ -142,10 +205,6 @@ def _folded(size: int, dims: tuple[Any, ...], tensors: list[Tensor]) -> list[Ten
     ]
 
 
-def _unfolded(tensor: Tensor, size: int) -> Tensor:
-    return tensor.reshape(len(tensor), size, -1)
-
-
 def _kernels() -> Any:
     return import_module("dolens.kernels.cpu.bent")
 
@@ -155,15 +214,15 @@ class Space:
     """The gap behind a surface is filled with a gradient.
 
     Attributes:
-        medium: the gradient.
-        base: index of its homogeneous medium, with what is added to it.
+        profile: of the index.
+        base: index of the homogeneous medium, with what is added to it.
         axes: of the surface in front, from which the profile counts.
         steps: that a ray takes through it.
         reach: of its profile, mm: a ray that is farther away is lost.
         kernels: whether the CPU's kernels may carry rays.
     """
 
-    medium: Gradient
+    profile: Profile
     base: Number
     axes: Axes
     steps: int
@@ -172,7 +231,7 @@ class Space:
 
     def bend(self, x: Number, y: Number, z: Number) -> Bend:
         """Return n² and its half gradient at points along `axes`, mm."""
-        return self.medium.bend(self.base, x, y, z)
+        return self.profile.bend(self.base, x, y, z)
 
     def index(self, point: tuple[Tensor, Tensor, Tensor], axes: Axes) -> Tensor:
         """Return the index at points in the axes of a surface, mm."""
@@ -205,7 +264,9 @@ class Space:
         start = _seen_from(ray, now, self.axes)
         with torch.no_grad():
             # No derivative is carried along while the place is looked for.
-            held = replace(self, base=still(self.base), axes=still(self.axes))
+            values = tuple(map(still, self.profile.values))
+            profile = replace(self.profile, values=values)
+            held = replace(self, profile=profile, base=still(self.base), axes=still(self.axes))
             begin = _seen_from(still(ray), still(now), held.axes)
             t, kept = held._time(held._motion(begin), still(then), meet_still)
         # A ray that is lost stays at the vertex: nothing infinite comes into the derivatives.
@@ -253,8 +314,15 @@ class Space:
             base = base.expand(t.shape)
         parts = torch.stack(torch.broadcast_tensors(*motion))
         given = (parts.reshape(7, -1), t.reshape(-1).contiguous(), base.reshape(-1).contiguous())
-        end = _Carry.apply(*given, self.medium, steps)
+        form = Form(self.profile.terms, self.profile.squared)
+        end = _Carry.apply(*given, self._coefficients(t), form, steps)
         return Motion(*end.reshape(7, *t.shape))
+
+    def _coefficients(self, like: Tensor) -> Tensor:
+        """Return the coefficients (14,) of all `TERMS`."""
+        options: dict[str, Any] = {"dtype": like.dtype, "device": like.device}
+        numbers = self.profile.coefficients
+        return torch.stack([torch.as_tensor(number, **options) for number in numbers])
 
     def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         x, y, z = (part.clamp(-self.reach, self.reach) for part in (x, y, z))

@@ -1,28 +1,15 @@
-"""Gradient-index media: the profile of their index, and rays that bend in them.
+"""Gradient-index media: the profile of their index, and the parameters that a lens holds of it.
 
-Along a ray let dt = ds/n, s being its length.  Position r and optical direction T = dr/dt, whose
-length is n, then follow (Sharma, Kumar and Ghatak, Appl. Opt. 21, 984 (1982))
-
-    dr/dt = T,   dT/dt = ½·∇n²(r),   dP/dt = ½·T² + ½·n²(r)
-
-with P the optical path ∫n·ds.  The two halves, T at rest and r at rest, are each solved exactly,
-and a symplectic splitting of order six joins them (Blanes and Moan, J. Comput. Appl. Math. 142, 313
-(2002), SRKN 11).  P is the action of this motion, and has the same order.
+`dolens.optics.bent_motion` carries rays through them, `dolens.optics.bent_paraxial` paraxial ones.
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
-from torch.utils.checkpoint import checkpoint
-
-from dolens.errors import InputError
-from dolens.kernels.table import DRIFTS, KICKS
-from dolens.optics.autograd import is_transformed
+from torch import Tensor, nn
 
 Number = Any  # of Python's, or a tensor
 
@@ -30,15 +17,6 @@ RADIAL = ("r2", "r4", "r6", "r8", "r10", "r12")
 AXIAL = ("z", "z2", "z3", "z4")
 ACROSS = ("x", "x2", "y", "y2")
 TERMS = (*RADIAL, *AXIAL, *ACROSS)
-
-# So many rays are traced once more for their derivatives, whose memory is then that of a step.
-_MANY = 4096
-# Steps per radian of phase, of which a parabolic profile has 2π a pitch, and the fewest: they err
-# by 1e-12 in double precision.
-_STEPS = {torch.float64: (8.0, 6), torch.float32: (2.0, 2)}
-_MOST_STEPS = 4096
-# Points along and across a gap at which its profile is looked at.
-_LOOKS = 17
 
 
 class Bend(NamedTuple):
@@ -57,63 +35,60 @@ class Bend(NamedTuple):
     z: Number
 
 
-@dataclass(frozen=True)
-class Gradient:
-    """A medium has an index that changes from place to place.
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A gradient adds Σ coefficient·term to its index or to the square of that.
 
-    n, or its square, is that of a homogeneous medium plus Σ coefficient·term, with r² = x² + y²
-    and z counted from the vertex of the surface in front of it, along the surface's axes.
+    r² = x² + y² and z count from the vertex of the surface in front, along the surface's axes.
 
     Attributes:
-        base: the homogeneous medium: it gives the index at that vertex.
-        terms: names and coefficients, 1/mm to the power of the term.
+        terms: names, in the order of `TERMS`.
+        values: their coefficients, 1/mm to the power of the term: numbers or tensors.
         squared: whether the terms add to n², and not to n.
     """
 
-    base: Any
-    terms: tuple[tuple[str, float], ...]
+    terms: tuple[str, ...]
+    values: tuple[Number, ...]
     squared: bool = False
 
-    @property
-    def name(self) -> str:
-        """Return the medium as a prescription writes it."""
-        words = (f"{term}={value!r}" for term, value in self.terms)
-        return " ".join((f"gradient{'_squared' if self.squared else ''}", self.base.name, *words))
-
-    def index(self, wavelength: float | Tensor) -> float | Tensor:
-        """Return the index at the vertex of the surface in front, at a wavelength in nm."""
-        return self.base.index(wavelength)
+    @cached_property
+    def _of_term(self) -> dict[str, Number]:
+        return dict(zip(self.terms, self.values, strict=True))
 
     @cached_property
-    def _coefficients(self) -> dict[str, float]:
-        return dict(self.terms)
-
-    @cached_property
-    def _polynomials(self) -> tuple[tuple[float, ...], ...]:
+    def _polynomials(self) -> tuple[tuple[Number, ...], ...]:
         """Return the coefficients of r², of z, of x and of y, each up to the last that is given."""
         found = []
         for names in (RADIAL, AXIAL, ACROSS[:2], ACROSS[2:]):
-            given = [k for k, name in enumerate(names, 1) if name in self._coefficients]
-            found.append(
-                tuple(self._coefficients.get(n, 0.0) for n in names[: max(given, default=0)])
-            )
+            given = [k for k, name in enumerate(names, 1) if name in self._of_term]
+            found.append(tuple(self._of_term.get(n, 0.0) for n in names[: max(given, default=0)]))
         return tuple(found)
 
     @cached_property
-    def coefficients(self) -> tuple[float, ...]:
+    def coefficients(self) -> tuple[Number, ...]:
         """Return the coefficients of all terms, in the order of `TERMS`."""
-        return tuple(self._coefficients.get(term, 0.0) for term in TERMS)
+        return tuple(self._of_term.get(term, 0.0) for term in TERMS)
 
     @cached_property
     def axial(self) -> bool:
         """Return whether the index changes along the axis."""
-        return any(term in AXIAL for term, _ in self.terms)
+        return any(term in AXIAL for term in self.terms)
 
-    def curvature(self, meridian: str | None) -> float:
+    @property
+    def rotational(self) -> bool:
+        """Return whether no term singles out a direction across the axis."""
+        return not any(term in ACROSS for term in self.terms)
+
+    def double(self) -> "Profile":
+        """Return the profile in double precision; derivatives flow back to its own tensors."""
+        values = (v.double() if isinstance(v, Tensor) else v for v in self.values)
+        return Profile(self.terms, tuple(values), self.squared)
+
+    def curvature(self, meridian: str | None) -> Number:
         """Return the coefficient of r² in a section `x` or `y`, or in their mean (None), 1/mm²."""
-        of = self._coefficients.get
+        of = self._of_term.get
         both = (of("x2", 0.0), of("y2", 0.0))
-        across = 0.5 * sum(both) if meridian is None else both["xy".index(meridian)]
+        across = 0.5 * (both[0] + both[1]) if meridian is None else both["xy".index(meridian)]
         return of("r2", 0.0) + across
 
     def bend(self, base: Number, x: Number, y: Number, z: Number) -> Bend:
@@ -145,7 +120,7 @@ class Gradient:
         return Bend(n * abs(n), *(n * slope for slope in slopes))
 
 
-def _polynomial(coefficients: tuple[float, ...], u: Number) -> tuple[Number, Number]:
+def _polynomial(coefficients: tuple[Number, ...], u: Number) -> tuple[Number, Number]:
     """Return Σ c_k·u^k from k = 1, and its derivative."""
     value: Number = coefficients[-1]
     slope: Number = len(coefficients) * value
@@ -154,251 +129,78 @@ def _polynomial(coefficients: tuple[float, ...], u: Number) -> tuple[Number, Num
     return value * u, slope
 
 
-class Motion(NamedTuple):
-    """A ray in motion: position (mm), optical direction T, optical path (mm)."""
+@dataclass(frozen=True)
+class Gradient:
+    """A medium has an index that changes from place to place.
 
-    x: Number
-    y: Number
-    z: Number
-    tx: Number
-    ty: Number
-    tz: Number
-    path: Number
-
-
-def carry(
-    bend: Callable[[Number, Number, Number], Bend], start: Motion, t: Number, steps: int
-) -> Motion:
-    """Carry rays on by t = ∫ds/n (mm), in so many steps.
-
-    Args:
-        bend: n² and its half gradient at x, y, z.
-        start: tensors or numbers of one shape.
-        t: of each ray.
-        steps: one or more.
-    """
-    h = t / steps
-    motion = _kicked(bend, start, KICKS[0] * h)
-
-    def step(motion: Motion, last: float) -> Motion:
-        for drift, kick in zip(DRIFTS, (*KICKS[1:-1], last), strict=True):
-            motion = _kicked(bend, _drifted(motion, drift * h), kick * h)
-        return motion
-
-    replays = (
-        torch.is_grad_enabled()
-        and isinstance(motion.x, Tensor)
-        and motion.x.numel() >= _MANY
-        and not is_transformed()
-    )
-    for k in range(steps):
-        # The last kick of a step and the first of the next are one.
-        last = (2.0 if k + 1 < steps else 1.0) * KICKS[0]
-        if replays:
-            motion = checkpoint(step, motion, last, use_reentrant=False, preserve_rng_state=False)
-        else:
-            motion = step(motion, last)
-    return motion
-
-
-def _kicked(bend: Callable[[Number, Number, Number], Bend], motion: Motion, k: Number) -> Motion:
-    x, y, z, tx, ty, tz, path = motion
-    squared, fx, fy, fz = bend(x, y, z)
-    return Motion(x, y, z, tx + k * fx, ty + k * fy, tz + k * fz, path + 0.5 * k * squared)
-
-
-def _drifted(motion: Motion, d: Number) -> Motion:
-    x, y, z, tx, ty, tz, path = motion
-    path = path + 0.5 * d * (tx * tx + ty * ty + tz * tz)
-    return Motion(x + d * tx, y + d * ty, z + d * tz, tx, ty, tz, path)
-
-
-def steps_through(
-    medium: Gradient, base: float, start: float, length: float, radius: float, dtype: torch.dtype
-) -> int:
-    """Return the steps of a ray through a gap.
-
-    Args:
-        medium: in the gap.
-        base: index of its homogeneous medium.
-        start: z of the gap's beginning, from the vertex that the profile counts from, mm.
-        length: along the axis, with its sign, mm.
-        radius: of what light passes, mm.
-        dtype: precision of the rays.
-
-    The fastest change of direction per t over a grid of points, √|∂(½∇n²)/∂r|, times t along the
-    axis is the phase.  Two digits of the lengths count.
-    """
-    lengths = (float(f"{number:.2g}") for number in (base, start, length, radius))
-    return _steps(medium, *lengths, dtype)
-
-
-@lru_cache(maxsize=1024)
-def _steps(
-    medium: Gradient, base: float, start: float, length: float, radius: float, dtype: torch.dtype
-) -> int:
-    fastest, slowest = 0.0, math.inf
-    step = 1e-4 * max(radius, abs(length), 1e-6)
-    for i in range(_LOOKS):
-        z = start + length * i / (_LOOKS - 1)
-        for j in range(_LOOKS):
-            r = radius * j / (_LOOKS - 1)
-            for x, y in ((r, 0.0), (0.0, r), (-r, 0.0), (0.0, -r)):
-                here = medium.bend(base, x, y, z)
-                if r == 0.0:
-                    slowest = min(slowest, max(here.squared, 0.0))
-                for dx, dy, dz in ((step, 0.0, 0.0), (0.0, step, 0.0), (0.0, 0.0, step)):
-                    there = medium.bend(base, x + dx, y + dy, z + dz)
-                    change = math.hypot(*(a - b for a, b in zip(there[1:], here[1:], strict=True)))
-                    fastest = max(fastest, change / step)
-    phase = math.sqrt(fastest) * (abs(length) + 0.5 * radius) / max(math.sqrt(slowest), 0.3)
-    rate, least = _STEPS.get(dtype, _STEPS[torch.float64])
-    if not math.isfinite(phase):
-        return _MOST_STEPS
-    return max(least, min(_MOST_STEPS, math.ceil(rate * phase)))
-
-
-class BentGap(NamedTuple):
-    """A gap of a gradient takes paraxial rays (y, n·u) to (a·y + b·n·u, c·y + d·n·u).
+    n, or its square, is that of a homogeneous medium plus the terms of a `Profile`.
 
     Attributes:
-        a: of the height.
-        b: of the height, mm.
-        c: of the slope, 1/mm.
-        d: of the slope.
-        behind: the index at its end, as paraxial optics takes it.
+        base: the homogeneous medium: it gives the index at the vertex of the surface in front.
+        terms: names and coefficients, 1/mm to the power of the term.
+        squared: whether the terms add to n², and not to n.
     """
 
-    a: Number
-    b: Number
-    c: Number
-    d: Number
-    behind: Number
+    base: Any
+    terms: tuple[tuple[str, float], ...]
+    squared: bool = False
+
+    @property
+    def name(self) -> str:
+        """Return the medium as a prescription writes it."""
+        words = (f"{term}={value!r}" for term, value in self.terms)
+        return " ".join((f"gradient{'_squared' if self.squared else ''}", self.base.name, *words))
+
+    def index(self, wavelength: float | Tensor) -> float | Tensor:
+        """Return the index at the vertex of the surface in front, at a wavelength in nm."""
+        return self.base.index(wavelength)
+
+    def profile(self, values: Mapping[str, Number] | None = None) -> Profile:
+        """Return the profile of the index, with values in the place of the medium's own."""
+        given = dict(self.terms) if values is None else values
+        names = tuple(term for term, _ in self.terms)
+        return Profile(names, tuple(given[name] for name in names), self.squared)
 
 
-# Nodes of Gauss and Legendre along its axis.
-_NODES = 20
-
-
-@lru_cache(maxsize=1)
-def _gauss() -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return nodes and weights of Gauss and Legendre on [0, 1] (Golub and Welsch)."""
-    k = torch.arange(1, _NODES, dtype=torch.float64)
-    off = k / (4.0 * k * k - 1.0).sqrt()
-    values, vectors = torch.linalg.eigh(torch.diag(off, 1) + torch.diag(off, -1))
-    return tuple((0.5 * (values + 1.0)).tolist()), tuple((vectors[0] ** 2).tolist())
-
-
-def bent_gap(
-    medium: Gradient, base: Number, start: Number, thickness: Number, meridian: str | None = None
-) -> BentGap:
-    """Return the paraxial gap of a gradient.
-
-    y'' = κ·y along t with κ = ½·∂²n²/∂y² on the axis; n·u = dy/dt.  Terms in x and y alone, which
-    tilt the axis, are left out.
+class GradientTerms(nn.Module):
+    """Holds the coefficients of the gradient behind a surface as parameters by their names, `r2`.
 
     Args:
         medium: the gradient.
-        base: index of its homogeneous medium.
-        start: z of the gap's beginning from the vertex that the profile counts from, mm.
-        thickness: with its sign, mm.
-        meridian: section `x` or `y`; None: the mean.
-
-    Raises:
-        InputError: the index is not positive there.
+        like: of the precision and on the device of the lens.
     """
 
-    def index(z: Number) -> Number:
-        squared = medium.bend(base, 0.0, 0.0, z).squared
-        if not plain(squared) > 0.0:
-            raise InputError(
-                f"material '{medium.name}': its index is not positive on the axis at "
-                f"{plain(z):g} mm"
-            )
-        return squared**0.5
-
-    way = -1.0 if plain(thickness) < 0.0 else 1.0
-    curvature = medium.curvature(meridian)
-    behind = index(start + thickness)
-    if not medium.axial:
-        n = index(0.0)
-        kappa = curvature if medium.squared else 2.0 * n * curvature
-        return BentGap(*_exponential(kappa, way * thickness / n, curvature), behind)
-    nodes, weights = _gauss()
-    t = sum(
-        w * (way * thickness) / index(start + u * thickness)
-        for u, w in zip(nodes, weights, strict=True)
-    )
-
-    def bend(y: Number, y2: Number, z: Number) -> Bend:
-        here = medium.bend(base, 0.0, 0.0, z)
-        kappa = curvature if medium.squared else 2.0 * abs(here.squared) ** 0.5 * curvature
-        return Bend(0.0, kappa * y, kappa * y2, here.z)
-
-    begin = Motion(1.0, 0.0, start, 0.0, 1.0, way * index(start), 0.0)
-    lengths = (plain(start), plain(thickness))
-    steps = steps_through(medium, plain(base), *lengths, 1e-3 * abs(lengths[1]), torch.float64)
-    end = carry(bend, begin, t, steps)
-    return BentGap(end.x, end.y, end.tx, end.ty, behind)
+    def __init__(self, medium: Gradient, like: Tensor) -> None:
+        super().__init__()
+        for term, value in medium.terms:
+            self.register_parameter(term, nn.Parameter(torch.full_like(like, value)))
 
 
-def gap_of_gradient(
-    thicknesses: Sequence[Number], origin: int, place: int
-) -> tuple[Number, Number]:
-    """Return where a gap begins, from the vertex that its profile counts from, and its length, mm.
+def hold_terms(media: Sequence[Any], surfaces: Iterable[Any], like: Tensor) -> None:
+    """Give the surfaces that gradients begin behind their coefficients as parameters.
 
     Args:
-        thicknesses: of all gaps.
-        origin: number of the surface that the profile counts from.
-        place: of the medium.
+        media: before surface 1 and behind each surface.
+        surfaces: of the lens.
+        like: of the precision and on the device of the lens.
     """
-    return sum(thicknesses[origin - 1 : place - 1], 0.0), thicknesses[place - 1]
+    for medium, surface in zip(media[1:], surfaces, strict=True):
+        begins = isinstance(medium, Gradient) and not surface.changes_axes
+        surface.gradient = GradientTerms(medium, like.detach()) if begins else None
 
 
-def paraxial_gaps(
-    thicknesses: Sequence[Number],
-    materials: Sequence[Any],
-    places: Mapping[int, int],
-    indices: Sequence[Number],
-    senses: Sequence[float],
-    meridian: str | None = None,
-) -> list[Any]:
-    """Return gaps as paraxial rays take them: lengths, and `BentGap` of gradients.
-
-    Args:
-        thicknesses: of all gaps, mm.
-        materials: of all media.
-        places: of gradients, and the surfaces that their profiles count from.
-        indices: of these alone, negative where light travels towards -z.
-        senses: +1 where light travels towards +z, -1 towards -z; of all media.
-        meridian: section `x` or `y`; None: the mean.
-    """
-    gaps = list(thicknesses)
-    for (place, origin), signed in zip(places.items(), indices, strict=True):
-        sense = senses[place]
-        start, length = gap_of_gradient(thicknesses, origin, place)
-        gap = bent_gap(materials[place], sense * signed, start, length, meridian)
-        gaps[place - 1] = gap._replace(behind=sense * gap.behind)
-    return gaps
-
-
-def plain(value: Number) -> float:
-    """Return a number without a graph, of several the mean, as it is beneath transforms."""
-    if not isinstance(value, Tensor):
-        return float(value)
-    return torch.func.debug_unwrap(value.detach(), recurse=True).double().mean().item()
-
-
-def _exponential(kappa: Number, t: Number, sign: float) -> tuple[Number, Number, Number, Number]:
-    """Return the matrix of y'' = κ·y over t; κ has this sign."""
-    if sign == 0.0:
-        return 1.0, t, 0.0, 1.0
-    rate = (kappa if sign > 0.0 else -kappa) ** 0.5
-    phase = rate * t
-    library: Any = torch if isinstance(phase, Tensor) else math
-    cosine, sine = (
-        (library.cosh(phase), library.sinh(phase))
-        if sign > 0.0
-        else (library.cos(phase), library.sin(phase))
-    )
-    return cosine, sine / rate, (1.0 if sign > 0.0 else -1.0) * rate * sine, cosine
+def with_terms(media: tuple[Any, ...], surfaces: Iterable[Any]) -> tuple[Any, ...]:
+    """Return media, the gradients among them with the coefficients that surfaces hold now."""
+    if not any(isinstance(medium, Gradient) for medium in media):
+        return media
+    found = [media[0]]
+    for medium, surface in zip(media[1:], surfaces, strict=True):
+        if surface.gradient is not None:
+            stored = dict(surface.gradient.named_parameters())
+            terms = tuple((term, float(stored[term].detach())) for term, _ in medium.terms)
+            medium = Gradient(medium.base, terms, medium.squared)
+        elif isinstance(medium, Gradient):
+            # A coordinate break stands within the medium.
+            medium = found[-1]
+        found.append(medium)
+    return tuple(found)

@@ -17,7 +17,7 @@ from dolens.optics.crystals import Uniaxial
 from dolens.optics.dispersion import require_wavelengths
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fabrication_errors import astigmatism_of, index_offsets, irregular
-from dolens.optics.gradients import Gradient
+from dolens.optics.gradients import Gradient, hold_terms, with_terms
 from dolens.optics.image_surface import image_surface, register_image_surface
 from dolens.optics.lens_data import LensData
 from dolens.optics.lens_rays import LensRays
@@ -166,7 +166,6 @@ class Lens(LensRays, InStates, nn.Module):
         self.optimization: Any = None
         check_choice(backend, BACKENDS, "backend")
         self.backend = backend
-        self.materials = tuple(materials)
         self.surfaces = ModuleTable[Surface](
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
@@ -176,6 +175,7 @@ class Lens(LensRays, InStates, nn.Module):
             self.thicknesses[str(number)] = nn.Parameter(torch.tensor(float(gap), dtype=dtype))
         self.elements = ModuleTable[Element](dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
+        self.materials = materials
         self.states, self.state_name = LensStates(), None
         self.given: Mapping[str, Tensor] = {}
         register_image_surface(self, given.sensor_curvature, given.sensor_conic, dtype)
@@ -183,6 +183,19 @@ class Lens(LensRays, InStates, nn.Module):
         self._kept_system = KeptSystem()
         self.reversals: tuple[int, ...] = ()
         self.reversals = reversals(self.system(), self.primary_wavelength)
+
+    @property
+    def materials(self) -> tuple[Medium, ...]:
+        """Return the media before surface 1 and behind each surface, `MIRROR` behind one that
+        reflects; gradients have the coefficients that the lens stores now.
+        """
+        return with_terms(self._materials, self.surfaces.values())
+
+    @materials.setter
+    def materials(self, media: Sequence[Medium]) -> None:
+        if tuple(media) != getattr(self, "_materials", None):
+            hold_terms(media, self.surfaces.values(), self.sensor_distance)
+        self._materials = tuple(media)
 
     @property
     def dtype(self) -> torch.dtype:  # type: ignore[override]
@@ -300,7 +313,7 @@ class Lens(LensRays, InStates, nn.Module):
 
     def _system(self, values: dict[str, Tensor]) -> OpticalSystem:
         """Return the lens as pure functions see it; what is used of `values` is taken out."""
-        surfaces = []
+        surfaces, profiles = [], {}
         for number, surface in self.surfaces.items():
             parameters = _stored_or_given(surface, values, f"surfaces.{number}.")
             edge = values.pop(f"surfaces.{number}.semi_diameter", None) if values else None
@@ -321,6 +334,10 @@ class Lens(LensRays, InStates, nn.Module):
                     surface.diffractive, values, f"surfaces.{number}.diffractive."
                 )
                 relief = surface.diffractive.state(own)
+            medium = self._materials[int(number)]
+            if surface.gradient is not None and isinstance(medium, Gradient):
+                own = _stored_or_given(surface.gradient, values, f"surfaces.{number}.gradient.")
+                profiles[int(number)] = medium.profile(own)
             state = SurfaceState(type(surface), parameters, aperture, edge, law, coating, relief)
             astigmatism = astigmatism_of(self, number, values) if values else None
             surfaces.append(irregular(state, astigmatism) if astigmatism else state)
@@ -341,7 +358,7 @@ class Lens(LensRays, InStates, nn.Module):
         offsets = index_offsets(self, values) if values else ()
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
-        materials, mirrors = media_of(self.materials)
+        materials, mirrors = media_of(self._materials)
         system = OpticalSystem(
             surfaces,
             thicknesses,
@@ -355,6 +372,7 @@ class Lens(LensRays, InStates, nn.Module):
             image,
             self.fields is not None and self.fields.from_the_side,
             offsets,
+            profiles=profiles,
         )
         if not ideal_lenses(system):
             return system

@@ -158,7 +158,7 @@ def overlaid(lens: Any, name: str) -> Any:
     own = dict(state.named_parameters())
     # What deepcopy finds here it takes as it is.
     memo: dict[int, Any] = {id(tensor): tensor for tensor in (*lens.parameters(), *lens.buffers())}
-    memo |= {id(medium): medium for medium in lens.materials}
+    memo |= {id(medium): medium for medium in lens._materials}
     memo |= {id(parameter): own[base] for base, parameter in lens.named_parameters() if base in own}
     memo[id(lens.states)] = LensStates()
     found = copy.deepcopy(lens, memo)

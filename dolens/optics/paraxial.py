@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.gradients import BentGap
+from dolens.optics.bent_paraxial import BentGap
 from dolens.optics.materials import is_anisotropic
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.optics.bent_paraxial import BentGap, paraxial_gaps
 from dolens.optics.elements import LENS_AXES, change_axes
-from dolens.optics.gradients import BentGap, paraxial_gaps
+from dolens.optics.gradients import Profile
 from dolens.optics.materials import Medium, is_anisotropic
 from dolens.optics.paraxial import (
     TwoRays,
@@ -151,7 +152,7 @@ class ParaxialNumbers:
         powers: what each surface adds to the power of refraction, a constant (1/mm) and a
             coefficient of the wavelength (1/(mm nm)); None where none adds any.
         offsets: added to the index of each medium; () where nothing is.
-        gradients: places of gradients, and the surfaces that their profiles count from.
+        gradients: places of gradients, the surfaces that their profiles count from, and these.
     """
 
     curvatures: tuple[Number, ...]
@@ -163,7 +164,7 @@ class ParaxialNumbers:
     senses: tuple[float, ...]
     powers: tuple[tuple[Number, Number], ...] | None = None
     offsets: tuple[Number, ...] = ()
-    gradients: tuple[tuple[int, int], ...] = ()
+    gradients: tuple[tuple[int, tuple[int, Profile]], ...] = ()
 
     @classmethod
     @torch.no_grad()
@@ -171,6 +172,7 @@ class ParaxialNumbers:
         """The numbers of a lens."""
         curvatures, powers, offsets = curvatures_of(system), _powers(system), _offsets(system)
         scalars = [*curvatures, *system.thicknesses, system.sensor_distance, *powers, *offsets]
+        scalars += _coefficients(system)
         numbers = torch.stack(
             [torch.as_tensor(s, dtype=torch.float64, device=system.device) for s in scalars]
         ).tolist()
@@ -185,7 +187,7 @@ class ParaxialNumbers:
         curvatures, powers, offsets = curvatures_of(system), _powers(system), _offsets(system)
         radius = system.surfaces[system.stop - 1].edge_radius
         lengths = [*system.thicknesses, system.sensor_distance]
-        scalars = [*curvatures, *lengths, *powers, *offsets, radius]
+        scalars = [*curvatures, *lengths, *powers, *offsets, *_coefficients(system), radius]
         if not any(isinstance(s, Tensor) and s.requires_grad for s in scalars):
             return None
         *numbers, edge = (torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars)
@@ -195,8 +197,17 @@ class ParaxialNumbers:
     def _of_numbers(
         cls, system: OpticalSystem, numbers: Sequence[Any], radius: Any, powers: int
     ) -> "ParaxialNumbers":
-        """Take apart curvatures, gaps, the sensor's distance, powers and offsets, in this order."""
+        """Take apart curvatures, gaps, the sensor's distance, powers, offsets and coefficients of
+        gradients, in this order.
+        """
         count = len(system.surfaces)
+        place = 2 * count + powers
+        offsets = tuple(numbers[place : place + len(system.index_offsets)])
+        rest, gradients = iter(numbers[place + len(offsets) :]), []
+        for k, origin in system.gradients.items():
+            profile = system.profile(k)
+            own = replace(profile, values=tuple(next(rest) for _ in profile.values))
+            gradients.append((k, (origin, own)))
         return cls(
             tuple(numbers[:count]),
             tuple(numbers[count : 2 * count - 1]),
@@ -206,8 +217,8 @@ class ParaxialNumbers:
             radius,
             system.senses,
             _pairs(numbers[2 * count : 2 * count + powers]),
-            tuple(numbers[2 * count + powers :]),
-            tuple(system.gradients.items()),
+            offsets,
+            tuple(gradients),
         )
 
     @property
@@ -273,9 +284,7 @@ class ParaxialNumbers:
         if not self.gradients:
             return self.thicknesses
         indices = [self._index(place, wavelength) for place, _ in self.gradients]
-        return paraxial_gaps(
-            self.thicknesses, self.materials, dict(self.gradients), indices, self.senses
-        )
+        return paraxial_gaps(self.thicknesses, dict(self.gradients), indices, self.senses)
 
     def _index(self, medium: int, wavelength: float) -> Number:
         """Return a medium's index, negative where light travels towards -z."""
@@ -288,6 +297,11 @@ class ParaxialNumbers:
 def _offsets(system: OpticalSystem) -> list[Number]:
     """Return what is added to the index of each medium; nothing without any."""
     return [0.0 if offset is None else offset for offset in system.index_offsets]
+
+
+def _coefficients(system: OpticalSystem) -> list[Number]:
+    """Return the coefficients of all gradients."""
+    return [value for place in system.gradients for value in system.profile(place).values]
 
 
 def _powers(system: OpticalSystem) -> list[Number]:

@@ -191,7 +191,7 @@ def prescription_table(lens: Any) -> PrescriptionTable:
         values = {
             name: float(value)
             for name, value in surface.named_parameters()
-            if value.ndim == 0 and not name.startswith("coating.")
+            if value.ndim == 0 and not name.startswith(("coating.", "gradient."))
         }
         if surface.changes_axes:
             turned = {n: to_file_units(n, value) for n, value in values.items()}

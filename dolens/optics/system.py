@@ -9,8 +9,8 @@ that it was made of.
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from operator import attrgetter, is_, itemgetter
@@ -20,17 +20,12 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.bent_motion import plain, steps_through
+from dolens.optics.bent_paraxial import BentGap, gap_of_gradient, paraxial_gaps
 from dolens.optics.bent_rays import Space
 from dolens.optics.crystals import Crystal, turned_axis
 from dolens.optics.elements import Axes, ElementState, surface_axes
-from dolens.optics.gradients import (
-    BentGap,
-    Gradient,
-    gap_of_gradient,
-    paraxial_gaps,
-    plain,
-    steps_through,
-)
+from dolens.optics.gradients import Gradient, Profile
 from dolens.optics.materials import Medium, absorption, is_anisotropic
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
@@ -76,6 +71,8 @@ class OpticalSystem:
             none is.
         meridian: the section of the lens that first-order optics is of, `x` (the x-z plane) or `y`;
             None: the mean over azimuth.  See `section`.
+        profiles: number of the surface that a gradient begins behind → its profile with the lens's
+            own coefficients; of others it is the medium's.
     """
 
     surfaces: Sequence[SurfaceState]
@@ -91,6 +88,7 @@ class OpticalSystem:
     from_the_side: bool = False
     index_offsets: tuple[Tensor | None, ...] = ()
     meridian: str | None = None
+    profiles: Mapping[int, Profile] = field(default_factory=dict)
 
     @cached_property
     def senses(self) -> tuple[float, ...]:
@@ -161,6 +159,12 @@ class OpticalSystem:
             place -= 1
         return place
 
+    def profile(self, place: int) -> Profile:
+        """Return the profile of the gradient at a place (from 0)."""
+        medium, begins = self.materials[place], self.beginning(place)
+        assert isinstance(medium, Gradient)  # as its place says
+        return self.profiles[begins] if begins in self.profiles else medium.profile()
+
     def spaces(self, wavelength: float | Tensor) -> dict[int, Space]:
         """Return the gaps in which rays bend, by the place of their medium; wavelengths in nm."""
         if not self.gradients:
@@ -169,13 +173,12 @@ class OpticalSystem:
         kernels = self.backend == "auto" and self.device.type == "cpu"
         kernels = kernels and self.dtype in (torch.float32, torch.float64)
         for place, origin in self.gradients.items():
-            medium, n = self.materials[place], indices[place]
-            assert isinstance(medium, Gradient)  # as its place says
+            profile, n = self.profile(place), indices[place]
             radius = max(s.semi_diameter for s in self.surfaces[place - 1 : place + 1])
             start, length = map(plain, gap_of_gradient(self.thicknesses, origin, place))
-            steps = steps_through(medium, plain(n), start, length, radius, self.dtype)
+            steps = steps_through(profile, plain(n), start, length, radius, self.dtype)
             reach = _REACH * (radius + abs(start) + abs(length))
-            found[place] = Space(medium, n, axes[origin - 1], steps, reach, kernels)
+            found[place] = Space(profile, n, axes[origin - 1], steps, reach, kernels)
         return found
 
     def paraxial_gaps(self, wavelength: float | Tensor) -> list[Tensor | BentGap]:
@@ -184,16 +187,16 @@ class OpticalSystem:
             return list(self.thicknesses)
         signed = self.signed_indices(wavelength)
         indices = [signed[place] for place in self.gradients]
-        return paraxial_gaps(
-            *(self.thicknesses, self.materials, self.gradients, indices, self.senses),
-            self.meridian,
-        )
+        profiles = {k: (origin, self.profile(k)) for k, origin in self.gradients.items()}
+        return paraxial_gaps(self.thicknesses, profiles, indices, self.senses, self.meridian)
 
     def refracts(self, number: int) -> bool:
         """Return whether a surface changes the direction of light, by refraction or reflection."""
         before, behind = self.materials[number - 1], self.materials[number]
-        # The axes of one crystal and another may be turned, although they are written alike.
-        return number in self.mirrors or before != behind or is_anisotropic(behind)
+        # The axes of one crystal and another may be turned, although they are written alike, and a
+        # gradient begins anew.
+        own = is_anisotropic(behind) or isinstance(behind, Gradient)
+        return number in self.mirrors or before != behind or own
 
     @cached_property
     def anisotropic(self) -> tuple[int, ...]:
@@ -327,7 +330,8 @@ class OpticalSystem:
         laws = all(s.deflection is None or s.deflection.law.rotational for s in self.surfaces)
         media: list[Any] = [self.materials[k] for k in self.anisotropic]
         along = all(medium.axis[:2] == (0.0, 0.0) for medium in media)
-        return surfaces and laws and along and not self.elements
+        round_ = all(self.profile(place).rotational for place in self.gradients)
+        return surfaces and laws and along and round_ and not self.elements
 
     def section(self, meridian: str | None) -> "OpticalSystem":
         """Return the same lens, whose first-order optics is that of one section; see `meridian`.
@@ -355,6 +359,7 @@ class OpticalSystem:
                 replace(e, parameters={n: p.double() for n, p in e.parameters.items()})
                 for e in self.elements
             ],
+            profiles={n: profile.double() for n, profile in self.profiles.items()},
         )
 
     def opened(self) -> "OpticalSystem":
@@ -448,7 +453,7 @@ class _Places(NamedTuple):
     def parts(self, lens: nn.Module) -> _Parts:
         """Return what stands there now."""
         own = lens.__dict__
-        things = [*_ATTRIBUTES(own), *own["materials"]]
+        things = [*_ATTRIBUTES(own), *own["_materials"]]
         things += chain.from_iterable(map(dict.values, self.tables))
         things += map(_OF_SURFACE, self.surfaces)
         things += chain.from_iterable(map(_OF_ELEMENT, self.elements))
@@ -461,7 +466,10 @@ def _places(lens: nn.Module) -> _Places:
     surfaces = tuple(modules["surfaces"]._modules.values())
     elements = tuple(modules["elements"]._modules.values())
     parts = (
-        part for s in surfaces for part in (s.phase, s.coating, s.diffractive) if part is not None
+        part
+        for s in surfaces
+        for part in (s.phase, s.coating, s.diffractive, s.gradient)
+        if part is not None
     )
     tables = [modules[name]._modules for name in ("surfaces", "elements")]
     for module in (modules["thicknesses"], *surfaces, *parts, *elements):
@@ -491,6 +499,8 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
                 tensors.append(surface.relief.heights)
     for element in system.elements:
         tensors += element.parameters.values()
+    for profile in system.profiles.values():
+        tensors += profile.values
     return all(id(tensor) in stored for tensor in tensors)
 
 

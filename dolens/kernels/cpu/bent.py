@@ -22,23 +22,25 @@ from dolens.kernels.cpu.threads import spread, thread_count
 from dolens.kernels.table import DRIFTS, KICKS
 
 # Places in the job, an array of integers: addresses of arrays;
-MOTION, TIME, BASE, PROFILE, COTANGENT, OF_BASE, WORK = range(7)
-# rays, steps, whether n² has the profile, numbers from one ray's base to the next's.
-RAYS, STEPS, SQUARED, BASE_STEP = range(7, 11)
+MOTION, TIME, BASE, PROFILE, COTANGENT, OF_BASE, OF_PROFILE, WORK = range(8)
+# rays, steps, whether n² has the profile, numbers from one ray's base to the next's, whether the
+# profile has derivatives.
+RAYS, STEPS, SQUARED, BASE_STEP, VARIES = range(8, 13)
 _JOB = 16
 _BLOCK = 64
 # Coefficients of r², r⁴, ..., r¹²; z, ..., z⁴; x, x²; y, y².
 COEFFICIENTS = 14
 _PARTS = 7  # of a motion: position, optical direction, path
-# Rows of a block's memory: a motion, a step, the base; its tangents or cotangents, and the base's.
-_H, _BASE, _C, _OF_BASE = 7, 8, 9, 16
-_WORK = 17 * _BLOCK
+# Rows of a block's memory: a motion, a step, the base; its tangents or cotangents, and the base's;
+# cotangents of the coefficients.
+_H, _BASE, _C, _OF_BASE, _OF_PROFILE = 7, 8, 9, 16, 17
+_WORK = (17 + COEFFICIENTS) * _BLOCK
 _INLINED = {**OPTIONS, "forceinline": True}
 _STAGES = len(DRIFTS)
 
 
 @cache
-def _profile(real: types.Type) -> tuple[Any, Any, Any]:
+def _profile(real: types.Type) -> tuple[Any, Any, Any, Any]:
     """Compile the profile's ½n² and ½∇n², and what derivatives need of it.
 
     Coefficients come as a tuple: in memory that is also written to they would be read at each ray.
@@ -73,8 +75,8 @@ def _profile(real: types.Type) -> tuple[Any, Any, Any]:
         return half * n * abs(n), n * gx, n * gy, n * gz
 
     @njit(**_INLINED)
-    def tangent(c, base, squared, x, y, z, a, b, d, e):  # noqa: ANN001, ANN202
-        """Return ½n² and ½∇n², and their tangents along (a, b, d) and e of the base."""
+    def tangent(c, base, squared, x, y, z, a, b, d, e, varies, dc):  # noqa: ANN001, ANN202
+        """Return ½n² and ½∇n², and their tangents along (a, b, d), e of the base and dc."""
         value, gx, gy, gz, slope, u = slopes(c, x, y, z)
         bend = (((thirty * c[5] * u + twenty * c[4]) * u + twelve * c[3]) * u + six * c[2]) * u
         across = four * (bend + two * c[1]) * (x * a + y * b)
@@ -82,6 +84,9 @@ def _profile(real: types.Type) -> tuple[Any, Any, Any]:
         hy = two * (slope + c[13]) * b + across * y
         hz = ((twelve * c[9] * z + six * c[8]) * z + two * c[7]) * d
         along = gx * a + gy * b + gz * d
+        if varies:
+            value_, gx_, gy_, gz_, _, _ = slopes(dc, x, y, z)
+            hx, hy, hz, along = hx + gx_, hy + gy_, hz + gz_, along + value_
         if squared:
             phi, of_phi = half * (base * base + value), half * along + base * e
             fx, fy, fz = half * gx, half * gy, half * gz
@@ -94,7 +99,9 @@ def _profile(real: types.Type) -> tuple[Any, Any, Any]:
 
     @njit(**_INLINED)
     def adjoint(c, base, squared, x, y, z, a, b, d, p):  # noqa: ANN001, ANN202
-        """Return ½∇n², the cotangent of the position of ½∇n²·(a, b, d) + ½n²·p, and of the base."""
+        """Return ½∇n², the cotangent of the position of ½∇n²·(a, b, d) + ½n²·p, and of the base;
+        then those of the profile, and by what ∇ of it is multiplied along (a, b, d).
+        """
         value, gx, gy, gz, slope, u = slopes(c, x, y, z)
         bend = (((thirty * c[5] * u + twenty * c[4]) * u + twelve * c[3]) * u + six * c[2]) * u
         across = four * (bend + two * c[1]) * (x * a + y * b)
@@ -105,16 +112,35 @@ def _profile(real: types.Type) -> tuple[Any, Any, Any]:
             fx, fy, fz = half * gx, half * gy, half * gz
             return (
                 fx, fy, fz, half * hx + p * fx, half * hy + p * fy, half * hz + p * fz, p * base,
+                half * p, half,
             )  # fmt: skip
         n = base + value
         along = gx * a + gy * b + gz * d
         fx, fy, fz = n * gx, n * gy, n * gz
         return (
             fx, fy, fz, gx * along + n * hx + p * fx, gy * along + n * hy + p * fy,
-            gz * along + n * hz + p * fz, along + p * n,
+            gz * along + n * hz + p * fz, along + p * n, along + p * n, n,
         )  # fmt: skip
 
-    return force, tangent, adjoint
+    @njit(**_INLINED)
+    def gather(w, i, k, x, y, z, a, b, d, g, m):  # noqa: ANN001, ANN202
+        """Add k times the cotangents of a ray's coefficients: g·term + m·∇term·(a, b, d)."""
+        u, v, g = x * x + y * y, k * m * two * (x * a + y * b), k * g
+        a, b, d = k * m * a, k * m * b, k * m * d
+        power, order = real(1.0), real(1.0)
+        for row in range(6):
+            w[(_OF_PROFILE + row) * _BLOCK + i] += power * (g * u + order * v)
+            power, order = power * u, order + real(1.0)
+        power, order = real(1.0), real(1.0)
+        for row in range(6, 10):
+            w[(_OF_PROFILE + row) * _BLOCK + i] += power * (g * z + order * d)
+            power, order = power * z, order + real(1.0)
+        w[(_OF_PROFILE + 10) * _BLOCK + i] += g * x + a
+        w[(_OF_PROFILE + 11) * _BLOCK + i] += x * (g * x + two * a)
+        w[(_OF_PROFILE + 12) * _BLOCK + i] += g * y + b
+        w[(_OF_PROFILE + 13) * _BLOCK + i] += y * (g * y + two * b)
+
+    return force, tangent, adjoint, gather
 
 
 @cache
@@ -125,7 +151,7 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
     a time.
     """
     at = real_at(real)
-    force, tangent, adjoint = _profile(real)
+    force, tangent, adjoint, gather = _profile(real)
     half, zero = real(0.5), real(0.0)
 
     @njit(**OPTIONS)
@@ -152,7 +178,7 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             w[_BASE * _BLOCK + i] = bases[ray * job[BASE_STEP]]
 
     @njit(**OPTIONS)
-    def onwards(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
+    def onwards(block, c, squared, drift, kick, varies, dc):  # noqa: ANN001, ANN202
         w = carray(block, _WORK)
         for i in range(_BLOCK):
             h, base = w[_H * _BLOCK + i], w[_BASE * _BLOCK + i]
@@ -167,7 +193,7 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             w[5 * _BLOCK + i], w[6 * _BLOCK + i] = k + d * fz, path + d * phi
 
     @njit(**OPTIONS)
-    def along(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
+    def along(block, c, squared, drift, kick, varies, dc):  # noqa: ANN001, ANN202
         w = carray(block, _WORK)
         for i in range(_BLOCK):
             h, base, e = w[_H * _BLOCK + i], w[_BASE * _BLOCK + i], w[_OF_BASE * _BLOCK + i]
@@ -178,7 +204,9 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             x, y, z = w[i] + d * u, w[_BLOCK + i] + d * v, w[2 * _BLOCK + i] + d * k
             a, b = w[_C * _BLOCK + i] + d * du, w[(_C + 1) * _BLOCK + i] + d * dv
             s = w[(_C + 2) * _BLOCK + i] + d * dk
-            phi, fx, fy, fz, of_phi, gx, gy, gz = tangent(c, base, squared, x, y, z, a, b, s, e)
+            phi, fx, fy, fz, of_phi, gx, gy, gz = tangent(
+                c, base, squared, x, y, z, a, b, s, e, varies, dc
+            )
             path = w[6 * _BLOCK + i] + half * d * (u * u + v * v + k * k)
             of_path = w[(_C + 6) * _BLOCK + i] + d * (u * du + v * dv + k * dk)
             d = kick * h
@@ -191,7 +219,7 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
             w[(_C + 6) * _BLOCK + i] = of_path + d * of_phi
 
     @njit(**OPTIONS)
-    def backwards(block, c, squared, drift, kick):  # noqa: ANN001, ANN202
+    def backwards(block, c, squared, drift, kick, varies):  # noqa: ANN001, ANN202
         w = carray(block, _WORK)
         for i in range(_BLOCK):
             h, base = w[_H * _BLOCK + i], w[_BASE * _BLOCK + i]
@@ -200,8 +228,10 @@ def _stages(real: types.Type) -> tuple[Any, Any, Any, Any]:
                 w[(_C + 3) * _BLOCK + i], w[(_C + 4) * _BLOCK + i], w[(_C + 5) * _BLOCK + i],
             )  # fmt: skip
             p = w[(_C + 6) * _BLOCK + i]
-            fx, fy, fz, gx, gy, gz, g = adjoint(c, base, squared, x, y, z, a, b, e, p)
+            fx, fy, fz, gx, gy, gz, g, own, m = adjoint(c, base, squared, x, y, z, a, b, e, p)
             k, d = kick * h, drift * h
+            if varies:
+                gather(w, i, k, x, y, z, a, b, e, own, m)
             u, v = w[3 * _BLOCK + i] - k * fx, w[4 * _BLOCK + i] - k * fy
             s = w[5 * _BLOCK + i] - k * fz
             rx, ry = w[_C * _BLOCK + i] + k * gx, w[(_C + 1) * _BLOCK + i] + k * gy
@@ -239,9 +269,14 @@ def _carrier(real: types.Type, tangents: bool) -> Callable[..., None]:
     def kernel(job_, first, end):  # noqa: ANN001, ANN202
         job = carray(job_, _JOB)
         count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
+        varies = tangents and job[VARIES] != 0
         found = carray(at(job[address]), UNBOUNDED)
         n = carray(at(job[PROFILE]), COEFFICIENTS)
         c = (
+            n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
+        )  # fmt: skip
+        n = carray(at(job[OF_PROFILE] if varies else job[PROFILE]), COEFFICIENTS)
+        dc = (
             n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13],
         )  # fmt: skip
         block = at(job[WORK])
@@ -254,13 +289,13 @@ def _carrier(real: types.Type, tangents: bool) -> Callable[..., None]:
                 for i in range(_BLOCK):
                     ray = min(begin + i, count - 1)
                     w[_OF_BASE * _BLOCK + i] = of_bases[ray * job[BASE_STEP]]
-            stage_of(block, c, squared, zero, kicks[0])
+            stage_of(block, c, squared, zero, kicks[0], varies, dc)
             for step in range(steps):
                 for stage in range(_STAGES):
                     kick = kicks[stage + 1]
                     if stage == _STAGES - 1 and step < steps - 1:
                         kick = double
-                    stage_of(block, c, squared, drifts[stage], kick)
+                    stage_of(block, c, squared, drifts[stage], kick, varies, dc)
             for row in range(_PARTS):
                 for i in range(min(_BLOCK, count - begin)):
                     found[row * count + begin + i] = w[(moved + row) * _BLOCK + i]
@@ -279,7 +314,9 @@ def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
     def kernel(job_, first, end):  # noqa: ANN001, ANN202
         job = carray(job_, _JOB)
         count, steps, squared = job[RAYS], job[STEPS], job[SQUARED] != 0
+        varies, blocks = job[VARIES] != 0, (count + _BLOCK - 1) // _BLOCK
         cotangent = carray(at(job[COTANGENT]), UNBOUNDED)
+        of_profile = carray(at(job[OF_PROFILE]), UNBOUNDED)
         of_bases = carray(at(job[OF_BASE]), UNBOUNDED)
         n = carray(at(job[PROFILE]), COEFFICIENTS)
         c = (
@@ -290,30 +327,31 @@ def carry_adjoint_driver(real: types.Type) -> Callable[..., None]:
         for number in range(first, end):
             begin = number * _BLOCK
             begin_block(job_, block, begin, True)
-            for i in range(_BLOCK):
-                w[_OF_BASE * _BLOCK + i] = zero
+            for i in range(_OF_BASE * _BLOCK, _WORK):
+                w[i] = zero
             for step in range(steps):
                 for stage in range(_STAGES - 1, -1, -1):
                     kick = kicks[stage + 1]
                     if stage == _STAGES - 1 and step > 0:
                         kick = double
-                    backwards(block, c, squared, drifts[stage], kick)
-            backwards(block, c, squared, zero, kicks[0])
+                    backwards(block, c, squared, drifts[stage], kick, varies)
+            backwards(block, c, squared, zero, kicks[0], varies)
             for i in range(min(_BLOCK, count - begin)):
                 of_bases[begin + i] = w[_OF_BASE * _BLOCK + i]
                 for row in range(_PARTS):
                     cotangent[row * count + begin + i] = w[(_C + row) * _BLOCK + i]
+            if varies:
+                for row in range(COEFFICIENTS):
+                    total = zero
+                    for i in range(_BLOCK):
+                        total += w[(_OF_PROFILE + row) * _BLOCK + i]
+                    of_profile[row * blocks + number] = total
 
     return kernel
 
 
 def carry(
-    motion: Tensor,
-    time: Tensor,
-    base: Tensor,
-    profile: tuple[float, ...],
-    squared: bool,
-    steps: int,
+    motion: Tensor, time: Tensor, base: Tensor, profile: Tensor, squared: bool, steps: int
 ) -> Tensor:
     """Carry rays through a gradient.
 
@@ -321,7 +359,7 @@ def carry(
         motion: (7, N): position, mm, optical direction, path, mm; it is overwritten.
         time: (N,), ∫ds/n, mm.
         base: (N,) or (1,), index of the homogeneous medium.
-        profile: `COEFFICIENTS` of them.
+        profile: (14,), coefficients of r², r⁴, ..., r¹²; z, ..., z⁴; x, x²; y, y².
         squared: whether n² has this profile, and not n.
         steps: one or more.
 
@@ -340,7 +378,8 @@ def carry_tangent(
     time: Tensor,
     base: Tensor,
     of_base: Tensor,
-    profile: tuple[float, ...],
+    profile: Tensor,
+    of_profile: Tensor,
     squared: bool,
     steps: int,
 ) -> Tensor:
@@ -351,11 +390,14 @@ def carry_tangent(
         tangent: (7, N), of it; it is overwritten.
         time: as of `carry`, and what follows.
         of_base: tangent of the base, of its shape.
+        of_profile: tangent of the profile.
     """
     job, kept = _job(motion, time, base, profile, squared, steps)
+    of_profile = of_profile.contiguous()
     job[COTANGENT], job[OF_BASE] = tangent.data_ptr(), of_base.data_ptr()
+    job[OF_PROFILE], job[VARIES] = of_profile.data_ptr(), bool(of_profile.any())
     _run(carry_tangent_driver, job, motion)
-    del kept
+    del kept, of_profile
     return tangent
 
 
@@ -364,39 +406,39 @@ def carry_adjoint(
     cotangent: Tensor,
     time: Tensor,
     base: Tensor,
-    profile: tuple[float, ...],
+    profile: Tensor,
     squared: bool,
     steps: int,
-) -> tuple[Tensor, Tensor]:
-    """Return the cotangents (7, N) of the beginning, and (N,) of the base, from those of the end.
+    varies: bool = False,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return the cotangents (7, N) of the beginning, (N,) of the base, and (14,) of the profile,
+    from those of the end.
 
     Args:
         motion: (7, N), the end.
         cotangent: (7, N), of it; it is overwritten.
         time: as of `carry`, and what follows.
+        varies: whether those of the profile are wanted; None comes in their place.
     """
     of_base = torch.empty_like(time)
+    of_profile = motion.new_empty(COEFFICIENTS, -(-time.numel() // _BLOCK) if varies else 0)
     job, kept = _job(motion, time, base, profile, squared, steps)
     job[COTANGENT], job[OF_BASE] = cotangent.data_ptr(), of_base.data_ptr()
+    job[OF_PROFILE], job[VARIES] = of_profile.data_ptr(), varies
     _run(carry_adjoint_driver, job, motion)
     del kept
-    return cotangent, of_base
+    return cotangent, of_base, of_profile.sum(1) if varies else None
 
 
 def _job(
-    motion: Tensor,
-    time: Tensor,
-    base: Tensor,
-    profile: tuple[float, ...],
-    squared: bool,
-    steps: int,
+    motion: Tensor, time: Tensor, base: Tensor, profile: Tensor, squared: bool, steps: int
 ) -> tuple[np.ndarray, Tensor]:
     """Return the job, and what must be kept as long as it runs."""
-    numbers = torch.tensor(profile, dtype=motion.dtype)
+    profile = profile.contiguous()
     job = np.zeros(_JOB, dtype=np.int64)
-    job[: PROFILE + 1] = [part.data_ptr() for part in (motion, time, base, numbers)]
+    job[: PROFILE + 1] = [part.data_ptr() for part in (motion, time, base, profile)]
     job[RAYS : BASE_STEP + 1] = (time.numel(), steps, squared, int(base.numel() > 1))
-    return job, numbers
+    return job, profile
 
 
 def _run(driver: compiler.Factory, job: np.ndarray, motion: Tensor) -> None:

@@ -26,6 +26,7 @@ from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
 if TYPE_CHECKING:
     from dolens.optics.coatings import Coating
     from dolens.optics.diffractive import DiffractiveElement
+    from dolens.optics.gradients import GradientTerms
     from dolens.optics.surfaces.deflection import Law
     from dolens.optics.surfaces.phase import Phase
 
@@ -168,6 +169,7 @@ class Surface(nn.Module):
         phase: a grating or a diffractive lens on this surface, or None.
         coating: what decides which share of the light passes, or None: all of it.
         diffractive: the relief of a diffractive element, which waves see and rays do not, or None.
+        gradient: coefficients of a gradient of the index behind this surface, or None.
     """
 
     kind: ClassVar[str] = ""
@@ -184,6 +186,7 @@ class Surface(nn.Module):
     phase: "Phase | None"
     coating: "Coating | None"
     diffractive: "DiffractiveElement | None"
+    gradient: "GradientTerms | None"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -205,6 +208,7 @@ class Surface(nn.Module):
         self.phase = None
         self.coating = None
         self.diffractive = None
+        self.gradient = None
         for name, value in parameters.items():
             tensor = tensor_of(value, name, dtype)
             if name in self.constants:
