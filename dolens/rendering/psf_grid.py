@@ -61,7 +61,7 @@ class FieldPointSpreadFunctions(NamedTuple):
 
     Attributes:
         functions: (N, D, C, K, K), upright, of the points' light about the central pixel; their
-            sums are relative illuminations, less what falls beyond the window.
+            sums are relative illuminations, less rays that fall beyond the window.
         light: (N, C), relative illumination by the same rays.
         truncated: (), the largest share of a function's light that falls beyond its window.
     """
@@ -153,31 +153,43 @@ def wave_point_spread_functions(
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
 
     Each function keeps the share of light that rays give it; what diffraction spreads beyond the
-    window is given back in proportion, but for a diffractive element's, whose other orders are lost
-    there.  Arguments as of `field_point_spread_functions`, how finely diffraction is computed, and
-    nm from each of the scene's wavelengths, whose light a function has in equal parts.
+    window is given back in proportion.  That of a diffractive element's other orders is haze, and
+    even within the window.  Arguments as of `field_point_spread_functions`, how finely diffraction
+    is computed, and nm from each of the scene's wavelengths, whose light a function has in equal
+    parts.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     at, waves, centres = object_points(imaging, points, _centres(imaging, points, distortion))
     lines = len(band)
     waves = (waves[:, None] + torch.as_tensor(band).to(waves)).flatten()
     places = at.repeat_interleave(lines, 0), waves, centres.repeat_interleave(lines, 0)
-    shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
-    kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
-    kernels = kernels.reshape(*shape, lines, size, size).mean(-3)
+    shape = (len(points[0]), len(scene.depths), len(scene.wavelengths), lines)
+    kernels, lost = _wave_kernels(system, places, PixelWindow(pitch, size), settings)
+    kernels = kernels.reshape(*shape, size, size).mean(-3)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _LIGHT_SAMPLES, 0, system)
-    seen = plane_points(imaging, points, disc)
-    light = seen.weight.sum(-1)
+    light = plane_points(imaging, points, disc).weight.sum(-1)
     total = kernels.sum((-2, -1))
-    lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
-    if system.diffractive:
-        # Other orders spread light beyond every window, which nothing gives back.
-        whole = element_flux(system, ObjectPoints.at(places[0]), *places[1:])
-        whole = whole.reshape(*shape, lines).mean(-1).to(total)
-        lost = torch.where(whole > 0.0, 1.0 - total / whole, 0.0).detach().max()
-        total = whole
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
-    return FieldPointSpreadFunctions(kernels * share[..., None, None], light[:, 0], lost)
+    beyond = lost.reshape(shape).mean(-1).max()
+    return FieldPointSpreadFunctions(kernels * share[..., None, None], light[:, 0], beyond)
+
+
+def _wave_kernels(
+    system: OpticalSystem,
+    places: tuple[Tensor, Tensor, Tensor],
+    window: PixelWindow,
+    settings: DiffractionSettings | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return `wave_kernels` (N, K, K) of places, and the shares of light (N,), without gradient,
+    that a diffractive element puts beyond the window: as haze, they are even within it.
+    """
+    kernels = wave_kernels(system, *places, window, settings)
+    if not system.diffractive:
+        return kernels, torch.zeros_like(kernels[:, 0, 0])
+    whole = element_flux(system, ObjectPoints.at(places[0]), *places[1:]).to(kernels)
+    haze = (whole - kernels.sum((-2, -1))).clamp(min=0.0)
+    kernels = kernels + (haze / window.size**2)[:, None, None]
+    return kernels, torch.where(whole > 0.0, haze / whole, 0.0).detach()
 
 
 def wave_cost(
@@ -361,7 +373,8 @@ def place_functions(
             pixels' pitch.
         points: x and y on the sensor, mm, each (N,), double precision.
         ideal: what the ideal camera sees there.
-        size: K, odd; light beyond is given back in proportion.
+        size: K, odd; light beyond is given back in proportion, and that of a diffractive element's
+            other orders evenly.
         diffraction: `none`; `limit`: blurred by a perfect pupil's; `wave`: of the wavefront.
         samples: strata along each side of the pupil.
 
@@ -381,7 +394,8 @@ def place_functions(
     functions = found.functions
     if diffraction == "wave":
         places = object_points(imaging, points, (ideal.rows[..., None], ideal.columns[..., None]))
-        functions = wave_kernels(system, *places, PixelWindow(pitch, size)).reshape_as(functions)
+        kernels, _ = _wave_kernels(system, places, PixelWindow(pitch, size))
+        functions = kernels.reshape_as(functions)
     elif diffraction == "limit":
         f_number = working_f_number(imaging.pupil, system.vertices[-1])
         functions = with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)

@@ -55,7 +55,8 @@ class PsfRenderer(Renderer):
         sensor: the pixels.
         fields: rows and columns of the grid; (1, 1) is one function for all pixels.
         pupil_samples: strata along each side of the pupil, for each function.
-        size: pixels along each side of a function, odd; light beyond is lost, and warned of.
+        size: pixels along each side of a function, odd; light beyond is lost, or even within where
+            a diffractive element's other orders put it there, and warned of.
         registration: `chief_rays`: functions are centred on the lens's own, distorted image points,
             and pixels look there; `pinhole`: on the undistorted ones, and shifts are part of the
             functions, which is cheaper, and exact where shifts change little between fields;
@@ -235,9 +236,12 @@ class PsfRenderer(Renderer):
 
     def _warn_of_loss(self, found: FieldPointSpreadFunctions) -> None:
         if float(found.truncated) > _NOTABLE_LOSS:
+            made = (
+                "keeps it" if self.diffraction != "wave" else "says where, not evenly within them"
+            )
             say_once(
                 f"renderer psf: {100 * float(found.truncated):.0f} % of a function's light falls "
-                f"beyond its {self.size} pixels; a larger renderer.size keeps it"
+                f"beyond its {self.size} pixels; a larger renderer.size {made}"
             )
 
     def point_spread_functions(

@@ -45,21 +45,31 @@ def test_at_the_design_wavelength_the_relief_is_the_phase_that_rays_follow():
     lens.surfaces["2"].diffractive = None
     # Without the relief the wavefront in the exit pupil makes the picture.
     wanted = renderer.render(lens, SCENE, texture(), 0)
-    # What the window loses is lost; the other way gives it back in proportion, some 1.6 % here.
-    share = float(found.mean() / wanted.mean())
-    assert 0.97 < share < 1.0
-    assert float((found - share * wanted).square().mean().sqrt()) < 0.002
+    # Light beyond the window, some 1.6 %, is even here; the other way gives it back in proportion.
+    assert float(found.mean()) == pytest.approx(float(wanted.mean()), rel=2e-3)
+    contrast = (
+        float(((found - found.mean()) * wanted).sum() / wanted.var(correction=0)) / wanted.numel()
+    )
+    assert 0.97 < contrast < 1.0
+    level = found.mean() + contrast * (wanted - wanted.mean())
+    assert float((found - level).square().mean().sqrt()) < 0.002
     rays = RayRenderer(SENSOR, 8).render(lens, SCENE, texture(), 0)
     assert float(found.mean()) == pytest.approx(float(rays.mean()), rel=0.05)
 
 
-def test_light_of_other_orders_is_lost_to_the_picture_and_levels_have_gradients():
+def test_light_of_other_orders_is_haze_and_levels_have_gradients():
     lens = flat_lens(torch.float32)
     coarse = flat_lens(torch.float32, levels=2)
     renderer = PsfRenderer(SENSOR, (1, 1), size=33, diffraction="wave")
     whole, binary = (renderer.render(one, SCENE, texture(), 0) for one in (lens, coarse))
-    # Two levels send 40.5 % into the first order; others are spread over a wide disc.
-    assert 0.38 < float(binary.mean() / whole.mean()) < 0.47
+    # Two levels send 4/π² = 40.5 % into the first order; others are spread over a wide disc.
+    assert float(binary.mean()) == pytest.approx(float(whole.mean()), rel=0.01)
+    inner = (slice(None),) * 3 + (slice(16, 48),) * 2
+    fine, coarse_bars = (
+        float((image - image.roll(9, -1))[inner].square().mean().sqrt())
+        for image in (whole, binary)
+    )
+    assert 0.38 < coarse_bars / fine < 0.47
     (slope,) = torch.autograd.grad(binary.square().mean(), coarse.surfaces["2"].phase.p4)
     assert float(slope) != 0.0
 
@@ -92,7 +102,9 @@ def test_a_network_is_told_waves_where_asked():
     shown = renderer.point_spread_functions(ImagingSystem.of(lens.system(), scene, SENSOR), 0)
     assert torch.allclose(told, shown.functions[0], atol=1e-3 * float(told.max()))
     # Rays know one order of an element of two levels, and all light in it.
-    assert float(told[0, 1].sum()) < 0.5 < 0.9 < float(rays[0, 1].sum())
+    sharp = (slice(12, 21),) * 2
+    assert float(told[0, 1][sharp].sum()) < 0.5 < 0.9 < float(rays[0, 1][sharp].sum())
+    assert float(told[0, 1].sum()) == pytest.approx(float(rays[0, 1].sum()), rel=0.02)
 
 
 def test_rays_do_not_show_heights_alone():
