@@ -82,8 +82,7 @@ def image_circle(lens: Lens) -> float:
 def usable_share(lens: Lens, sensor: Sensor) -> float:
     """Return the share of a sensor, along each side, whose chief rays pass the lens.
 
-    Renderers aim them at the centre of the paraxial exit pupil; where the pupil's aberrations are
-    large, as in the lenses of phones, those of a sensor's corners may not pass.
+    They are those of `chief_ray_points`.
 
     Returns:
         1, or less in steps of 0.05; 0 where half of the sensor is too much.

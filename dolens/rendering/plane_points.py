@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.ray_tracing import trace_rays
-from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.ray_tracing import say_once, trace_rays
+from dolens.optics.rays import Components, Rays, Status, TracedRays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
 from dolens.rendering.aperture_edges import AZIMUTHS, EdgeRays, edge_rays, pupil_boundary
@@ -140,9 +141,12 @@ def rim_rays(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> EdgeRays 
 def chief_ray_points(
     imaging: ImagingSystem, points: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Find where the rays from sensor points through the exit pupil's centre meet the planes.
+    """Find where the chief rays of sensor points meet the planes.
 
-    This is the image's geometry: distortion and, between wavelengths, lateral colour.
+    These go through the centre of the paraxial exit pupil.  Where one of them misses a surface or
+    is totally reflected, as in a wide lens whose pupil wanders, all of them go through the centre
+    of the stop, and the log says so.  This is the image's geometry: distortion and, between
+    wavelengths, lateral colour.
 
     Args:
         imaging: as in `plane_points`.
@@ -153,7 +157,7 @@ def chief_ray_points(
         device.
 
     Raises:
-        InputError: such a ray misses a surface or is totally reflected, so that it says nothing.
+        InputError: neither ray gets to the planes, so that they say nothing.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     x, y = (p.to(system.dtype) for p in _beside(system, points))
@@ -162,7 +166,13 @@ def chief_ray_points(
     wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, wavelengths[:, None])
     hit = trace_rays(system, rays, -1.0)
-    if bool(((hit.status == Status.TIR) | (hit.status == Status.MISSED)).any()):
+    if _any_lost(hit):
+        say_once(
+            "renderer: chief rays are those through the centre of the stop, since some through "
+            "the paraxial exit pupil's do not pass"
+        )
+        hit = trace_rays(system, rays_through_stop(system, (x, y), wavelengths), -1.0)
+    if _any_lost(hit):
         raise InputError(
             "renderer: chief rays of the sensor's outer pixels do not pass the lens, which leaves "
             "its distortion undefined; use registration=pinhole, renderer=rays or a smaller sensor"
@@ -177,6 +187,85 @@ def chief_ray_points(
         columns.append(torch.addcmul(there.x, t, there.l) * scale)
         rows.append(torch.addcmul(there.y, t, there.m) * -scale)
     return torch.stack(rows).permute(2, 0, 1), torch.stack(columns).permute(2, 0, 1)
+
+
+def _any_lost(hit: TracedRays) -> bool:
+    return bool(((hit.status == Status.TIR) | (hit.status == Status.MISSED)).any())
+
+
+# Steps from the axis to a point of the sensor, and Newton's iterations at each.
+_AIMING_STEPS, _CORRECTIONS = 16, 3
+# For central differences in double precision.
+_SLOPE_STEP = 1e-5
+
+
+def rays_through_stop(
+    system: OpticalSystem, points: tuple[Tensor, Tensor], wavelengths: Tensor
+) -> Rays:
+    """Return the rays from sensor points whose way back goes through the centre of the stop.
+
+    Newton's iteration for the ray's slopes u, with F(u) = 0 where it meets the stop, from the axis
+    outwards.  A last step within the autograd graph, u - J⁻¹·F(u), has the implicit derivatives.
+
+    Args:
+        system: the lens.
+        points: x and y, mm, each (N,).
+        wavelengths: (C,), nm.
+
+    Returns:
+        (C, N), at the sensor, travelling towards -z; those for which no ray is found go astray.
+    """
+    exact = system.double().opened()
+    place = torch.stack(points).double().detach()[:, None].expand(2, len(wavelengths), -1)
+    before = slopes = torch.zeros_like(place)
+    with torch.no_grad():
+        for step in range(_AIMING_STEPS + 1):
+            share = step / _AIMING_STEPS
+            guess = 2.0 * slopes - before
+            before = slopes
+            slopes = guess
+            for _ in range(_CORRECTIONS):
+                slopes = _corrected(exact, share * place, slopes, wavelengths)
+    slopes = _corrected(exact, place, slopes, wavelengths)
+    return Rays.from_components(_leaving(system, place, slopes), wavelengths[:, None])
+
+
+def _leaving(system: OpticalSystem, place: Tensor, slopes: Tensor) -> Components:
+    """Rays from the sensor of slopes (2, ...), dx/dz and dy/dz, towards -z."""
+    inverse = -torch.rsqrt(1.0 + slopes.square().sum(0))
+    (x, y), (l, m) = place.to(system.dtype), (slopes * inverse).to(system.dtype)  # noqa: E741
+    return Components(
+        x, y, system.vertices[-1].expand(inverse.shape), l, m, inverse.to(system.dtype)
+    )
+
+
+def _corrected(system: OpticalSystem, place: Tensor, slopes: Tensor, wavelengths: Tensor) -> Tensor:
+    """Return slopes (2, C, N) after an iteration of Newton's: differentiable in the lens, by where
+    rays meet the stop, and not in the slopes, whose derivatives are central differences.
+    """
+    step = slopes.new_tensor(
+        [
+            [0.0, 0.0],
+            [_SLOPE_STEP, 0.0],
+            [-_SLOPE_STEP, 0.0],
+            [0.0, _SLOPE_STEP],
+            [0.0, -_SLOPE_STEP],
+        ]
+    )
+    slopes = slopes.detach()
+    tried = slopes[:, None] + step.mT[..., None, None]
+    ray = _leaving(system, place[:, None].expand_as(tried), tried)
+    hit = trace_rays(
+        system, Rays.from_components(ray, wavelengths[:, None]), -1.0, first=system.stop
+    )
+    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+    x, y, *_ = from_lens_axes(there, system.axes[system.stop - 1])
+    miss = torch.stack((x, y), -1)
+    ends = miss[1:].detach()
+    jacobian = torch.stack((ends[0] - ends[1], ends[2] - ends[3]), -1) / (2.0 * _SLOPE_STEP)
+    singular = torch.linalg.det(jacobian).abs() <= torch.finfo(jacobian.dtype).tiny
+    jacobian = torch.where(singular[..., None, None], torch.eye(2).to(jacobian), jacobian)
+    return slopes - torch.linalg.solve(jacobian, miss[0]).movedim(-1, 0)
 
 
 def distinct_radii(points: tuple[Tensor, Tensor]) -> Tensor:

@@ -1,13 +1,17 @@
 """Where pixels look, as polynomials, against a ray for each of them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import yaml
 
+from dolens.diffraction.entrance_beam import ObjectPoints
+from dolens.diffraction.reference_sphere import chief_ray_intercepts
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering import chief_ray_map as module
 from dolens.rendering.chief_ray_map import chief_ray_maps, fit_chief_ray_map
-from dolens.rendering.exit_pupil import axial_exit_pupil
+from dolens.rendering.exit_pupil import ExitPupil, axial_exit_pupil
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
 from dolens.rendering.protocol import SensorWindow
@@ -93,3 +97,31 @@ def test_windows_rendered_together_are_those_rendered_one_by_one(root, registrat
         alone = PsfRenderer(window, **settings).render(lens, placed, textures[i : i + 1], 1)
         assert together[i].shape == alone[0].shape
         assert torch.allclose(together[i], alone[0], rtol=0, atol=2e-4)
+
+
+def test_where_rays_through_the_paraxial_pupil_do_not_pass_those_through_the_stop_serve(root):
+    """Rays forwards from the points that they find, aimed by other code, come back to pixels."""
+    lens = lens_of(root, "phone").requires_grad_(True)
+    system, sensor = lens.system(), Sensor(300, 300, 0.018)
+    scene = PlanarScene((1000.0,), (587.5618,))
+    # Rays towards a pupil just before the sensor are reflected totally.
+    pupil = ExitPupil(float(system.vertices[-1]) - 0.2, 0.1, 0.1)
+    x, y = torch.tensor([0.0, 1.5, 2.7, 0.0]).double(), torch.tensor([0.0, 1.0, 2.7, 3.0]).double()
+    imaging = ImagingSystem(system, scene, sensor, pupil)
+    rows, columns = (c[:, 0, 0] for c in chief_ray_points(imaging, (x, y)))
+    (magnification,) = scene.magnifications(system)
+    scale = sensor.pixel_pitch / magnification
+    places = torch.stack((columns * scale, -rows * scale, torch.full_like(x, -1000.0)), -1)
+    lines = torch.full_like(x, 587.5618)
+    landed = chief_ray_intercepts(system, ObjectPoints.at(places.detach()), lines)
+    assert torch.allclose(landed, torch.stack((x, y), -1), rtol=0.0, atol=1e-9)
+    # The image moves with the lens: against a difference.
+    value = lens.surfaces["9"].curvature
+    (slope,) = torch.autograd.grad(rows[2], value)
+    moved = []
+    with torch.no_grad():
+        for step in (1e-6, -2e-6):
+            value.add_(step)
+            now = replace(imaging, system=lens.system())
+            moved.append(float(chief_ray_points(now, (x, y))[0][2, 0, 0]))
+    assert float(slope) == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-5)
