@@ -24,7 +24,7 @@ from dolens.optics.elements import (
     points_to_lens_axes,
     to_lens_axes,
 )
-from dolens.optics.gradients import TERMS, Bend, Number, Profile
+from dolens.optics.gradients import KERNEL_TERMS, Bend, Number, Profile
 from dolens.optics.rays import Components
 
 # Newton's steps towards the next surface, and the share of a path's steps that all but the first
@@ -34,6 +34,8 @@ _APPROACHES, _SHARE = 6, 8
 _LEAST, _LARGEST = 1e-6, 1e4
 
 
+# Of more wavelengths PyTorch's operations carry rays through a profile that changes with them.
+_COLOURS = 16
 # Of fewer rays PyTorch's operations are at their end before a kernel is compiled.
 _FEW = 1024
 
@@ -51,15 +53,15 @@ class Form:
     squared: bool
 
     def profile(self, coefficients: Tensor) -> Profile:
-        """Return the profile with these coefficients of all `TERMS`, (14,)."""
-        values = tuple(coefficients[TERMS.index(term)] for term in self.terms)
+        """Return the profile with these coefficients of `KERNEL_TERMS`, (14,)."""
+        values = tuple(coefficients[KERNEL_TERMS.index(term)] for term in self.terms)
         return Profile(self.terms, values, self.squared)
 
 
 class _Carry(torch.autograd.Function):
     """Rays are carried through a gradient by the CPU's kernel; first derivatives only.
 
-    Coefficients (14,) are those of all `TERMS`; `form` has the names of the profile's own, and
+    Coefficients (14,) are those of `KERNEL_TERMS`; `form` has the names of the profile's own, and
     whether the terms add to n².
     """
 
@@ -220,6 +222,7 @@ class Space:
         steps: that a ray takes through it.
         reach: of its profile, mm: a ray that is farther away is lost.
         kernels: whether the CPU's kernels may carry rays.
+        colours: nm, wavelengths of the rays, where there are several.
     """
 
     profile: Profile
@@ -228,6 +231,7 @@ class Space:
     steps: int
     reach: float
     kernels: bool = False
+    colours: Tensor | None = None
 
     def bend(self, x: Number, y: Number, z: Number) -> Bend:
         """Return n² and its half gradient at points along `axes`, mm."""
@@ -309,20 +313,58 @@ class Space:
         """Return rays that are carried on by t."""
         if not self.kernels or not (is_transformed() or (t.numel() >= _FEW and is_eager([t]))):
             return carry(self.bend, motion, t, steps)
-        base = torch.as_tensor(self.base, dtype=t.dtype, device=t.device)
-        if base.numel() > 1:
-            base = base.expand(t.shape)
-        parts = torch.stack(torch.broadcast_tensors(*motion))
-        given = (parts.reshape(7, -1), t.reshape(-1).contiguous(), base.reshape(-1).contiguous())
-        form = Form(self.profile.terms, self.profile.squared)
-        end = _Carry.apply(*given, self._coefficients(t), form, steps)
-        return Motion(*end.reshape(7, *t.shape))
+        parts = torch.stack(torch.broadcast_tensors(*motion)).reshape(7, -1)
+        if not any(isinstance(v, Tensor) and v.numel() > 1 for v in self.profile.values):
+            end = self._by_kernel(
+                parts, t.reshape(-1), self._coefficients(t), self._bases(t), steps
+            )
+            return Motion(*end.reshape(7, *t.shape))
+        found = self._each_colour(t)
+        if found is None:
+            return carry(self.bend, motion, t, steps)
+        ends = [
+            self._by_kernel(parts[:, rays], t.reshape(-1)[rays], coefficients, base, steps)
+            for rays, coefficients, base in found
+        ]
+        order = torch.cat([rays for rays, _, _ in found]).argsort()
+        return Motion(*torch.cat(ends, 1)[:, order].reshape(7, *t.shape))
 
-    def _coefficients(self, like: Tensor) -> Tensor:
-        """Return the coefficients (14,) of all `TERMS`."""
+    def _by_kernel(
+        self, motion: Tensor, t: Tensor, coefficients: Tensor, base: Tensor, steps: int
+    ) -> Tensor:
+        form = Form(self.profile.terms, self.profile.squared)
+        end: Tensor = _Carry.apply(motion, t.contiguous(), base, coefficients, form, steps)
+        return end
+
+    def _bases(self, like: Tensor) -> Tensor:
+        """Return the base's index, (N,) or (1,)."""
+        base = torch.as_tensor(self.base, dtype=like.dtype, device=like.device)
+        return (base.expand(like.shape) if base.numel() > 1 else base).reshape(-1).contiguous()
+
+    def _coefficients(self, like: Tensor, ray: Tensor | None = None) -> Tensor:
+        """Return the coefficients (14,) of `KERNEL_TERMS`, of one ray where they differ."""
         options: dict[str, Any] = {"dtype": like.dtype, "device": like.device}
-        numbers = self.profile.coefficients
-        return torch.stack([torch.as_tensor(number, **options) for number in numbers])
+        numbers = [torch.as_tensor(number, **options) for number in self.profile.coefficients]
+        if ray is not None:
+            numbers = [n.expand(like.shape).reshape(-1)[ray] for n in numbers]
+        return torch.stack([number.reshape(()) for number in numbers])
+
+    def _each_colour(self, like: Tensor) -> list[tuple[Tensor, Tensor, Tensor]] | None:
+        """Return the rays of each wavelength, their coefficients and base; None where there are too
+        many, or derivatives with respect to them are wanted.
+        """
+        colours = self.colours
+        if colours is None or colours.requires_grad or not _is_plain(colours):
+            return None
+        several, which = colours.expand(like.shape).reshape(-1).unique(return_inverse=True)
+        if len(several) > _COLOURS:
+            return None
+        base, found = self._bases(like), []
+        for k in range(len(several)):
+            rays = (which == k).nonzero().squeeze(1)
+            own = base[rays] if base.numel() > 1 else base
+            found.append((rays, self._coefficients(like, rays[0]), own.contiguous()))
+        return found
 
     def _index(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         x, y, z = (part.clamp(-self.reach, self.reach) for part in (x, y, z))
@@ -360,6 +402,10 @@ class Space:
         for end in motion[:3]:
             kept = kept & (end.abs() < self.reach)
         return t.masked_fill(~kept, 0.0), kept
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
 
 
 def still(value: Any) -> Any:

@@ -294,9 +294,8 @@ def user_catalogues() -> dict[str, Path]:
     Raises:
         InputError: a place that `DOLENS_GLASS` names does not exist.
     """
-    named = [Path(place) for place in os.environ.get(VARIABLE, "").split(os.pathsep) if place]
     found: dict[str, Path] = {}
-    for place in (*_asked.get(), *named):
+    for place in _places():
         if os.path.isdir(place):
             files = sorted(p for p in _listed(place) if p.suffix.lower() == ".agf")
         elif os.path.exists(place):
@@ -306,6 +305,19 @@ def user_catalogues() -> dict[str, Path]:
         for file in files:
             found.setdefault("".join(file.stem.upper().split()), file)
     return found
+
+
+def user_file(name: str) -> Path | None:
+    """Return the file of a name, in any case, in the first folder of the user's that has one."""
+    folders = (place for place in _places() if os.path.isdir(place))
+    files = (file for folder in folders for file in sorted(_listed(folder)))
+    return next((file for file in files if file.name.upper() == name.upper()), None)
+
+
+def _places() -> tuple[Path, ...]:
+    """Return the user's folders and files, those that are asked for first."""
+    named = os.environ.get(VARIABLE, "").split(os.pathsep)
+    return (*_asked.get(), *(Path(place) for place in named if place))
 
 
 def _listed(folder: Path) -> list[Path]:

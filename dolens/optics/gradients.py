@@ -4,19 +4,26 @@
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from dolens.optics.dispersion import NM_PER_UM, Terms, cauchy
+from dolens.optics.wavelength_series import power_text
+
 Number = Any  # of Python's, or a tensor
 
+MOST_POWERS = 20
 RADIAL = ("r2", "r4", "r6", "r8", "r10", "r12")
-AXIAL = ("z", "z2", "z3", "z4")
-ACROSS = ("x", "x2", "y", "y2")
-TERMS = (*RADIAL, *AXIAL, *ACROSS)
+AXIAL, OF_X, OF_Y = (
+    (axis, *(f"{axis}{power}" for power in range(2, MOST_POWERS + 1))) for axis in "zxy"
+)
+TERMS = (*RADIAL, *AXIAL, *OF_X, *OF_Y)
+# Those that the kernels know, in their order.
+KERNEL_TERMS = (*RADIAL, *AXIAL[:4], *OF_X[:2], *OF_Y[:2])
 
 
 class Bend(NamedTuple):
@@ -59,15 +66,20 @@ class Profile:
     def _polynomials(self) -> tuple[tuple[Number, ...], ...]:
         """Return the coefficients of r², of z, of x and of y, each up to the last that is given."""
         found = []
-        for names in (RADIAL, AXIAL, ACROSS[:2], ACROSS[2:]):
+        for names in (RADIAL, AXIAL, OF_X, OF_Y):
             given = [k for k, name in enumerate(names, 1) if name in self._of_term]
             found.append(tuple(self._of_term.get(n, 0.0) for n in names[: max(given, default=0)]))
         return tuple(found)
 
     @cached_property
     def coefficients(self) -> tuple[Number, ...]:
-        """Return the coefficients of all terms, in the order of `TERMS`."""
-        return tuple(self._of_term.get(term, 0.0) for term in TERMS)
+        """Return the coefficients of `KERNEL_TERMS`."""
+        return tuple(self._of_term.get(term, 0.0) for term in KERNEL_TERMS)
+
+    @property
+    def has_kernel(self) -> bool:
+        """Return whether the kernels know all terms."""
+        return all(term in KERNEL_TERMS for term in self.terms)
 
     @cached_property
     def axial(self) -> bool:
@@ -77,12 +89,16 @@ class Profile:
     @property
     def rotational(self) -> bool:
         """Return whether no term singles out a direction across the axis."""
-        return not any(term in ACROSS for term in self.terms)
+        return not any(term in (*OF_X, *OF_Y) for term in self.terms)
 
     def double(self) -> "Profile":
         """Return the profile in double precision; derivatives flow back to its own tensors."""
-        values = (v.double() if isinstance(v, Tensor) else v for v in self.values)
-        return Profile(self.terms, tuple(values), self.squared)
+        return self.to(torch.float64)
+
+    def to(self, dtype: torch.dtype) -> "Profile":
+        """Return the profile with its tensors in a precision; likewise."""
+        values = (v.to(dtype) if isinstance(v, Tensor) else v for v in self.values)
+        return replace(self, values=tuple(values))
 
     def curvature(self, meridian: str | None) -> Number:
         """Return the coefficient of r² in a section `x` or `y`, or in their mean (None), 1/mm²."""
@@ -139,16 +155,20 @@ class Gradient:
         base: the homogeneous medium: it gives the index at the vertex of the surface in front.
         terms: names and coefficients, 1/mm to the power of the term.
         squared: whether the terms add to n², and not to n.
+        dispersions: names of terms whose coefficients change with the wavelength, and (a, e) of
+            the powers a·λᵉ, λ in µm, that are added to them.
     """
 
     base: Any
     terms: tuple[tuple[str, float], ...]
     squared: bool = False
+    dispersions: tuple[tuple[str, Terms], ...] = ()
 
     @property
     def name(self) -> str:
         """Return the medium as a prescription writes it."""
-        words = (f"{term}={value!r}" for term, value in self.terms)
+        of = dict(self.dispersions)
+        words = (f"{term}={value!r}{power_text(of.get(term, ()))}" for term, value in self.terms)
         return " ".join((f"gradient{'_squared' if self.squared else ''}", self.base.name, *words))
 
     def index(self, wavelength: float | Tensor) -> float | Tensor:
@@ -160,6 +180,17 @@ class Gradient:
         given = dict(self.terms) if values is None else values
         names = tuple(term for term, _ in self.terms)
         return Profile(names, tuple(given[name] for name in names), self.squared)
+
+    def profile_at(self, profile: Profile, wavelength: float | Tensor) -> Profile:
+        """Return the profile at a wavelength (nm), with this one's coefficients; a tensor of
+        wavelengths gives coefficients of its shape and in its precision.
+        """
+        if not self.dispersions:
+            return profile
+        added = {term: cauchy(wavelength / NM_PER_UM, 0.0, of) for term, of in self.dispersions}
+        pairs = zip(profile.terms, profile.values, strict=True)
+        values = tuple(v + added[t] if t in added else v for t, v in pairs)
+        return replace(profile, values=values)
 
 
 class GradientTerms(nn.Module):
@@ -198,7 +229,7 @@ def with_terms(media: tuple[Any, ...], surfaces: Iterable[Any]) -> tuple[Any, ..
         if surface.gradient is not None:
             stored = dict(surface.gradient.named_parameters())
             terms = tuple((term, float(stored[term].detach())) for term, _ in medium.terms)
-            medium = Gradient(medium.base, terms, medium.squared)
+            medium = replace(medium, terms=terms)
         elif isinstance(medium, Gradient):
             # A coordinate break stands within the medium.
             medium = found[-1]

@@ -17,7 +17,8 @@ from dolens.optics.crystals import RAYS, Uniaxial
 from dolens.optics.dispersion import ModelGlass, model_glass, require_wavelength
 from dolens.optics.glass import Environment, Glass
 from dolens.optics.glass_catalog import find_glass
-from dolens.optics.gradients import TERMS, Gradient
+from dolens.optics.gradients import MOST_POWERS, RADIAL, TERMS, Gradient
+from dolens.optics.wavelength_series import parse_series
 
 
 class Mirror:
@@ -285,14 +286,20 @@ def _with_partial_dispersion(
     return model_glass(name, nd, vd, deviation, model.lines)
 
 
+_ALL_TERMS = f"{', '.join(RADIAL)}; x, x2 to x{MOST_POWERS}, and of y and z"
+
+
 def _gradient(name: str, model: IndexModel, environment: Environment | None) -> Gradient:
     kind, *words = name.split()
     base = [word for word in words if "=" not in word]
+    dispersions: list[tuple[str, Any]] = []
     if len(base) != 1 or len(words) < 2:
         raise InputError(
             f"material '{name}': write a medium and terms, such as gradient 1.6 r2=-0.001"
         )
-    medium = _part_of(name, base[0], model, environment)
+    series = parse_series(base[0])
+    varies = series is not None and series.terms
+    medium: Any = series if varies else _part_of(name, base[0], model, environment)
     terms: dict[str, float] = {}
     for word in words:
         term, equals, value = word.lower().partition("=")
@@ -301,14 +308,19 @@ def _gradient(name: str, model: IndexModel, environment: Environment | None) -> 
         if term not in TERMS or term in terms:
             what = f"'{term}' is there twice" if term in terms else f"there is no term '{term}'"
             raise InputError(
-                f"material '{name}': {what}{did_you_mean(term, TERMS)} "
-                f"(allowed: {', '.join(TERMS)})"
+                f"material '{name}': {what}{did_you_mean(term, TERMS)} (allowed: {_ALL_TERMS})"
             )
-        if not re.fullmatch(_SIGNED, value) or not math.isfinite(float(value)):
-            raise InputError(f"material '{name}': {term} must be a number, not '{value}'")
-        terms[term] = float(value)
+        series = parse_series(value)
+        if series is None:
+            raise InputError(
+                f"material '{name}': {term} must be a number, not '{value}', or a series such as "
+                "-0.05+1e-4/w2 with the wavelength w in µm"
+            )
+        terms[term] = series.constant
+        if series.terms:
+            dispersions.append((term, series.terms))
     ordered = tuple((term, terms[term]) for term in TERMS if term in terms)
-    return Gradient(medium, ordered, kind.lower() == "gradient_squared")
+    return Gradient(medium, ordered, kind.lower() == "gradient_squared", tuple(dispersions))
 
 
 def _constant(text: str) -> Material:

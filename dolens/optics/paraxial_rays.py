@@ -284,7 +284,11 @@ class ParaxialNumbers:
         if not self.gradients:
             return self.thicknesses
         indices = [self._index(place, wavelength) for place, _ in self.gradients]
-        return paraxial_gaps(self.thicknesses, dict(self.gradients), indices, self.senses)
+        profiles = {}
+        for place, (origin, profile) in self.gradients:
+            medium: Any = self.materials[place]
+            profiles[place] = origin, medium.profile_at(profile, wavelength)
+        return paraxial_gaps(self.thicknesses, profiles, indices, self.senses)
 
     def _index(self, medium: int, wavelength: float) -> Number:
         """Return a medium's index, negative where light travels towards -z."""

@@ -159,26 +159,32 @@ class OpticalSystem:
             place -= 1
         return place
 
-    def profile(self, place: int) -> Profile:
-        """Return the profile of the gradient at a place (from 0)."""
+    def profile(self, place: int, wavelength: float | Tensor | None = None) -> Profile:
+        """Return the profile of the gradient at a place (from 0), at a wavelength (nm) or with the
+        parts of its coefficients that are the same at all.
+        """
         medium, begins = self.materials[place], self.beginning(place)
         assert isinstance(medium, Gradient)  # as its place says
-        return self.profiles[begins] if begins in self.profiles else medium.profile()
+        found = self.profiles[begins] if begins in self.profiles else medium.profile()
+        return found if wavelength is None else medium.profile_at(found, wavelength)
 
     def spaces(self, wavelength: float | Tensor) -> dict[int, Space]:
         """Return the gaps in which rays bend, by the place of their medium; wavelengths in nm."""
         if not self.gradients:
             return {}
         indices, axes, found = self.indices(wavelength), self.axes, {}
+        wavelength = self._finer(wavelength)
         kernels = self.backend == "auto" and self.device.type == "cpu"
         kernels = kernels and self.dtype in (torch.float32, torch.float64)
         for place, origin in self.gradients.items():
-            profile, n = self.profile(place), indices[place]
+            profile, n = self.profile(place, wavelength).to(self.dtype), indices[place]
+            served = kernels and profile.has_kernel
             radius = max(s.semi_diameter for s in self.surfaces[place - 1 : place + 1])
             start, length = map(plain, gap_of_gradient(self.thicknesses, origin, place))
             steps = steps_through(profile, plain(n), start, length, radius, self.dtype)
             reach = _REACH * (radius + abs(start) + abs(length))
-            found[place] = Space(profile, n, axes[origin - 1], steps, reach, kernels)
+            colours = wavelength if isinstance(wavelength, Tensor) else None
+            found[place] = Space(profile, n, axes[origin - 1], steps, reach, served, colours)
         return found
 
     def paraxial_gaps(self, wavelength: float | Tensor) -> list[Tensor | BentGap]:
@@ -187,7 +193,10 @@ class OpticalSystem:
             return list(self.thicknesses)
         signed = self.signed_indices(wavelength)
         indices = [signed[place] for place in self.gradients]
-        profiles = {k: (origin, self.profile(k)) for k, origin in self.gradients.items()}
+        wavelength = self._finer(wavelength)
+        profiles = {
+            k: (origin, self.profile(k, wavelength)) for k, origin in self.gradients.items()
+        }
         return paraxial_gaps(self.thicknesses, profiles, indices, self.senses, self.meridian)
 
     def refracts(self, number: int) -> bool:

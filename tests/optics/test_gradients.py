@@ -13,7 +13,7 @@ from dolens import InputError, Rays
 from dolens.analysis.ray_path import ray_path
 from dolens.optics import bent_rays
 from dolens.optics.bent_motion import Motion, carry
-from dolens.optics.gradients import TERMS, Bend, Gradient
+from dolens.optics.gradients import KERNEL_TERMS, Bend, Gradient
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens_family import trace_lenses
 from dolens.optics.materials import index_model, parse_material
@@ -328,12 +328,12 @@ def test_rays_that_are_lost_are_finite_and_spoil_no_gradient():
         assert parameter.grad is None or bool(parameter.grad.isfinite().all()), name
 
 
-@pytest.mark.parametrize("term", TERMS)
+@pytest.mark.parametrize("term", KERNEL_TERMS)
 @pytest.mark.parametrize("kind", ["gradient", "gradient_squared"])
 def test_the_kernel_differentiates_every_term(monkeypatch, kind, term):
     monkeypatch.setattr(bent_rays, "_FEW", 1)
-    words = " ".join(f"{name}={1e-3 * 0.1**i!r}" for i, name in enumerate(TERMS[:6]))
-    medium = f"{kind} 1.6 {words} " + " ".join(f"{name}=2e-3" for name in TERMS[6:])
+    words = " ".join(f"{name}={1e-3 * 0.1**i!r}" for i, name in enumerate(KERNEL_TERMS[:6]))
+    medium = f"{kind} 1.6 {words} " + " ".join(f"{name}=2e-3" for name in KERNEL_TERMS[6:])
     lens, name = lens_of(medium, 2.0, FRONT, BACK), f"surfaces.1.gradient.{term}"
     rays = beam(*RAYS["points"], slopes=RAYS["slopes"])
 
@@ -502,6 +502,8 @@ def test_a_medium_is_written_and_read_again():
     assert medium == lens.materials[1] and isinstance(medium, Gradient)
     assert medium.index(550.0) == parse_material("N-BK7", index_model("dfc")).index(550.0)
     assert bool(lens.first_order(400.0).efl != lens.first_order(700.0).efl)
+    coloured = lens_of(selfoc_medium(), 4.0).materials[1]
+    assert parse_material(coloured.name, index_model("dfc")) == coloured
 
 
 @pytest.mark.parametrize(
@@ -512,6 +514,8 @@ def test_a_medium_is_written_and_read_again():
         ("gradient 1.6 r3=1", "there is no term 'r3'.*allowed: r2, r4"),
         ("gradient 1.6 r2=1 r2=2", "'r2' is there twice"),
         ("gradient 1.6 r2=inf", "r2 must be a number, not 'inf'"),
+        ("gradient 1.6 r2=1e-3/w13", "r2 must be a number, not '1e-3/w13', or a series such as"),
+        ("gradient 1.6 z21=1", "there is no term 'z21'.*x, x2 to x20, and of y and z"),
         ("gradient mirror r2=1", "'mirror' is no medium with one index"),
         ("gradient N-BK8 r2=1", "unknown material 'N-BK8'"),
     ],
@@ -520,6 +524,104 @@ def test_a_medium_that_cannot_be_meant_is_refused(material, message):
     with pytest.raises(InputError, match=message) as caught:
         lens_of(material, 4.0)
     assert "surface 1" in str(caught.value) and "\n" not in str(caught.value)
+
+
+# SLW-1.8 of NSG, λ in µm: n0 = B + C/λ² and √A = K0 + K1/λ² + K2/λ⁴ of n = n0·(1 - A·r²/2).
+SELFOC = (1.5868, 8.14e-3), (0.3238, 5.364e-3, 2.626e-4)
+
+
+def selfoc(wavelength):
+    """n0 and √A (1/mm) of SLW-1.8 at a wavelength in nm."""
+    (b, c), (k0, k1, k2) = SELFOC
+    u = (1e-3 * wavelength) ** -2
+    return b + c * u, k0 + k1 * u + k2 * u * u
+
+
+def selfoc_medium():
+    """The same as a prescription writes it: r2 is a polynomial of degree five in 1/λ²."""
+    (b, c), k = SELFOC
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    root = k[0] + k[1] * u + k[2] * u * u
+    constant, *others = (-0.5 * (b + c * u) * root * root).coef.tolist()
+    r2 = f"{constant!r}" + "".join(f"{a:+.17g}/w{2 * n}" for n, a in enumerate(others, 1))
+    return f"gradient {b}+{c}/w2 r2={r2}"
+
+
+def test_a_rod_of_selfoc_has_its_focal_length_at_every_wavelength():
+    lens = lens_of(selfoc_medium(), 4.0)
+    for wavelength in (480.0, 632.8, 1300.0):
+        n0, g = selfoc(wavelength)
+        first = lens.first_order(wavelength)
+        assert float(first.efl) == pytest.approx(1.0 / (n0 * g * math.sin(4.0 * g)), rel=1e-12)
+        numbers = ParaxialNumbers.of(lens.system())
+        assert numbers.exit_pupil(wavelength)[0] == pytest.approx(float(first.exit_pupil.z))
+    # Zemax's prescription data of a file with GRINSUR9 and SLW-1.8 print these indices.
+    for wavelength, printed in ((1455.0, 1.59064502), (1420.0, 1.59083690), (1495.0, 1.59044202)):
+        assert float(lens.materials[1].index(wavelength)) == pytest.approx(printed, abs=1e-8)
+
+
+def test_rays_of_several_colours_take_the_kernel_and_what_each_alone_takes(monkeypatch):
+    lens = lens_of(selfoc_medium(), 4.0, FRONT, BACK)
+    points, slopes = RAYS["points"] * 4, RAYS["slopes"] * 4
+    waves = torch.tensor([480.0, 632.8, 1300.0, 632.8], dtype=torch.float64).repeat_interleave(3)
+    rays = beam(*(tuple(0.3 * p for p in point) for point in points), slopes=slopes)
+    rays = Rays(rays.position, rays.direction, waves)
+    found = []
+    for few in (1, 1000):
+        monkeypatch.setattr(bent_rays, "_FEW", few)
+        hit = trace_rays(lens.system(), rays)
+        outputs = torch.cat([hit.position, hit.direction, hit.path_length[:, None]], 1)
+        weights = torch.linspace(-1.0, 1.0, outputs.numel(), dtype=torch.float64)
+        grads = torch.autograd.grad(
+            outputs.reshape(-1) @ weights, list(lens.parameters()), allow_unused=True
+        )
+        found.append([outputs.detach(), *(g for g in grads if g is not None)])
+    for kernel, eager in zip(*found, strict=True):
+        close(kernel, eager, 3e-12 * max(1.0, float(eager.abs().max())))
+    for k in (0, 3, 6, 9):
+        alone = Rays(rays.position[k : k + 3], rays.direction[k : k + 3], float(waves[k]))
+        close(found[0][0][k : k + 3, :3], lens.trace(alone).position.detach(), 3e-13)
+    monkeypatch.setattr(bent_rays, "_FEW", 1)
+    name = "surfaces.1.gradient.r2"
+    forward = ray_jacobian(lens, rays, [name], ("x",)).derivatives[:, 0, 0]
+    value, step = lens.surfaces["1"].gradient.r2.detach(), 1e-6
+    high, low = (lens.with_values({name: value + s}).trace(rays) for s in (step, -step))
+    close(forward, ((high.position - low.position)[:, 0] / (2.0 * step)).detach(), 2e-8)
+
+
+def test_derivatives_with_respect_to_wavelengths_hold_where_a_profile_changes_with_them():
+    lens = lens_of(selfoc_medium(), 4.0, FRONT, BACK)
+    start = beam((0.1, 0.3))
+
+    def height(wavelength):
+        rays = Rays(start.position, start.direction, wavelength)
+        return trace_rays(lens.system(), rays).position[0, 1]
+
+    at = torch.tensor([600.0], dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(height(at), at)
+    known = (height(at.detach() + 0.1) - height(at.detach() - 0.1)) / 0.2
+    close(found[0], known.detach(), 1e-10)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_terms_of_high_power_bend_rays_as_their_derivatives_say(axis):
+    # ½∇n² of n = 1.6 + Σ c_k·u^k, by differences.
+    values = {f"{axis}{k}": 1e-3 * (-0.7) ** k for k in (3, 5, 20)}
+    words = " ".join(f"{term}={value!r}" for term, value in values.items())
+    profile = parse_material(f"gradient 1.6 {words}", index_model("dfc")).profile()
+    assert not profile.has_kernel
+    point, step = {"x": 0.9, "y": -0.8, "z": 1.1}, 1e-6
+
+    def square(**moved):
+        u = {**point, **moved}[axis]
+        return (1.6 + sum(c * u ** int(term[1:]) for term, c in values.items())) ** 2
+
+    bend = profile.bend(1.6, **point)
+    assert bend.squared == pytest.approx(square(), rel=1e-14)
+    for name in "xyz":
+        ends = (square(**{name: point[name] + s}) for s in (step, -step))
+        known = 0.5 * (next(ends) - next(ends)) / (2.0 * step)
+        assert getattr(bend, name) == pytest.approx(known, abs=1e-9)
 
 
 def test_a_profile_beyond_all_numbers_loses_rays_and_an_index_below_zero_is_refused(monkeypatch):

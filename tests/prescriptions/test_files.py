@@ -20,8 +20,8 @@ def folder(tmp_path):
     files = {
         "triplet.zmx": triplet().encode(),
         "sub/coated.ZMX": singlet(*GOOD, "COAT AR").encode(),
-        "grin.zmx": singlet("TYPE GRINSUR6", *GOOD).encode(),
-        "grin2.zmx": singlet(*GOOD).replace("CURV -0.02", "TYPE GRINSUR9\n  CURV -0.02").encode(),
+        "grin.zmx": singlet("TYPE GRINSUR7", *GOOD).encode(),
+        "grin2.zmx": singlet(*GOOD).replace("CURV -0.02", "TYPE GRINSUR8\n  CURV -0.02").encode(),
         "noise.zmx": bytes(range(256)) * 3,
         "empty.yaml": b"",
         "readme.md": b"no lens",

@@ -1,17 +1,23 @@
-"""The gradient-index media behind Zemax's surfaces GRINSUR1 to GRINSUR5.
+"""The gradient-index media behind Zemax's surfaces GRINSUR1 to GRINSUR6, GRINSUR9, GRINSU10 and
+GRINSU12.
 
 Their surface is that of TYPE STANDARD, and PARM has the profile of the medium behind it: PARM 1 is
 the largest step of a ray, which dolens chooses itself, PARM 2 the index at the vertex (its square
-for GRINSUR2), and the others are coefficients, in the file's unit of length.
+for GRINSUR2), and the others are coefficients, in the file's unit of length.  GRINSU10 is a series
+of |y|, of which even powers are held: the others have a kink on the axis.  GRINSU12 has the order
+of its polynomials in PARM 2 and the index in PARM 3; then come coefficients of x, y and z, of x²,
+y² and z², and so on.  GRINSUR6 and GRINSUR9 are glasses of a file (see
+`dolens.prescriptions.zemax.gradient_files`).
 
-Source: OpticStudio's help, "Gradient 1" to "Gradient 5".
+Source: OpticStudio's help, "Gradient 1" to "Gradient 12".
 """
 
 import math
 
 from dolens.errors import InputError
-from dolens.optics.gradients import TERMS
+from dolens.optics.gradients import MOST_POWERS
 from dolens.prescriptions.zemax.file import SurfaceBlock
+from dolens.prescriptions.zemax.gradient_files import FILES, gradient_glass
 
 # TYPE → terms of PARM 3, PARM 4, ...
 GRADIENTS: dict[str, tuple[str, ...]] = {
@@ -20,10 +26,27 @@ GRADIENTS: dict[str, tuple[str, ...]] = {
     "GRINSUR3": ("r2", "r4", "r6", "z", "z2", "z3"),
     "GRINSUR4": ("x", "x2", "y", "y2", "z", "z2"),
     "GRINSUR5": ("r2", "r4", "z", "z2", "z3", "z4"),
+    "GRINSU10": ("y", "y2", "y3", "y4", "y5", "y6"),
+    "GRINSU12": tuple(
+        f"{axis}{power if power > 1 else ''}"
+        for power in range(1, MOST_POWERS + 1)
+        for axis in "xyz"
+    ),
 }
-_SQUARED = "GRINSUR2"
-# The tangents of GRINSUR5's tilts, and what they are about.
-TILTS = dict.fromkeys(("PARM 9", "PARM 10"), "a tilted surface in front of a gradient is not held")
+_SQUARED, _ORDERED = "GRINSUR2", "GRINSU12"
+_TILTED = "a tilted surface in front of a gradient is not held"
+_KINKED = "an odd power of |y| is not held in a gradient"
+# TYPE → the slots of PARM that no medium holds, and what they are about.
+REFUSED = {
+    "GRINSUR5": dict.fromkeys(("PARM 9", "PARM 10"), _TILTED),
+    "GRINSUR9": dict.fromkeys(("PARM 2", "PARM 3"), _TILTED),
+    "GRINSU10": dict.fromkeys(("PARM 3", "PARM 5", "PARM 7"), _KINKED),
+}
+# TYPE → the last slot of PARM that has a meaning.
+SLOTS = {
+    **{kind: 2 + len(terms) + (kind == _ORDERED) for kind, terms in GRADIENTS.items()},
+    **dict.fromkeys(FILES, 1),
+}
 
 
 def gradient_medium(block: SurfaceBlock) -> str | None:
@@ -32,22 +55,47 @@ def gradient_medium(block: SurfaceBlock) -> str | None:
     Raises:
         InputError: the index is not positive, or its dispersion stands in another file.
     """
+    glass = block.words("GLAS")
+    if block.type in FILES:
+        return _of_a_file(block, glass)
     terms = GRADIENTS.get(block.type)
     if terms is None:
         return None
-    if block.words("GLAS"):
+    if glass:
         raise InputError(
             f"{block.place}: a gradient-index medium with a dispersion of its own is not held "
-            f"(GLAS {block.words('GLAS')[0]}, which stands in a file of Zemax's)"
+            f"(GLAS {glass[0]}, which stands in Zemax's SGRIN.DAT)"
         )
-    n = block.slot("PARM 2")
+    ordered = block.type == _ORDERED
+    first = f"PARM {3 if ordered else 2}"
+    n = block.slot(first)
     if not n > 0.0:
         raise InputError(
-            f"{block.place}: PARM 2, the index at the vertex, must be positive, not {n:g}"
+            f"{block.place}: {first}, the index at the vertex, must be positive, not {n:g}"
         )
     squared = block.type == _SQUARED
-    powers = {term: int(term[1:] or 1) for term in TERMS}
-    values = {term: block.slot(f"PARM {slot}", -powers[term]) for slot, term in enumerate(terms, 3)}
+    values = {
+        term: block.slot(f"PARM {slot}", -int(term[1:] or 1))
+        for slot, term in enumerate(terms, 4 if ordered else 3)
+    }
+    order = block.slot("PARM 2") if ordered else 0.0
+    beyond = [t for t, v in values.items() if v and int(t[1:] or 1) > order] if ordered else []
+    if beyond:
+        raise InputError(
+            f"{block.place}: PARM 2 says that the polynomials are of order {order:g}, but there is "
+            f"a coefficient of {beyond[0]}"
+        )
     base = repr(math.sqrt(n) if squared else n)
     words = [f"{term}={value!r}" for term, value in values.items() if value]
     return " ".join([f"gradient{'_squared' * squared}", base, *words]) if words else base
+
+
+def _of_a_file(block: SurfaceBlock, glass: list[str]) -> str:
+    if not glass:
+        raise InputError(f"{block.place}: TYPE {block.type} needs GLAS, a gradient-index glass")
+    if block.factor != 1:
+        raise InputError(
+            f"{block.place}: the gradient-index glass {glass[0]} is given in mm, and the file is "
+            "in another unit of length"
+        )
+    return gradient_glass(block.type, glass[0], block.place)

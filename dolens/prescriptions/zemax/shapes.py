@@ -21,7 +21,7 @@ from dolens.prescriptions.numbers import as_number, power_of
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
-from dolens.prescriptions.zemax.gradients import GRADIENTS, TILTS
+from dolens.prescriptions.zemax.gradients import REFUSED, SLOTS
 from dolens.prescriptions.zemax.table import (
     CONIC,
     ORDER,
@@ -402,11 +402,11 @@ SHAPES = {
                 kinds=(),
                 kind="conic",
                 base=CONIC,
-                others=_parm(*range(1, 3 + len(terms))),
-                refused=TILTS if kind == "GRINSUR5" else {},
+                others=_parm(*range(1, last + 1)),
+                refused=REFUSED.get(kind, {}),
                 own_read=None,
             )
-            for kind, terms in GRADIENTS.items()
+            for kind, last in SLOTS.items()
         ),
     )
 }

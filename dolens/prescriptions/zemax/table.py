@@ -113,7 +113,9 @@ class ZemaxShape:
             held |= {f"XDAT {self.count}", f"XDAT {self.count + 1}"}
         for slot, word in block.slots.items():
             operand = slot[:4]
-            if slot in held or slot in self.others or float(word) == 0.0:
+            if slot in held or float(word) == 0.0:
+                continue
+            if slot in self.others and slot not in self.refused:
                 continue
             if slot in self.refused or operand in self.refused:
                 what = self.refused.get(slot) or self.refused[operand]

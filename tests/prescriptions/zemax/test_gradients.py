@@ -5,6 +5,7 @@ import math
 import pytest
 
 from dolens import InputError, load_lens
+from dolens.optics.glass_catalog import glass_folders
 from dolens.prescriptions.files import check_file
 from dolens.prescriptions.zemax.reader import read_zemax
 from tests.prescriptions.zemax.samples import GLASS, singlet
@@ -44,6 +45,12 @@ def medium(*given, **more):
             "gradient 1.6 r2=-0.002 r4=0.0001 z=0.03 z2=-0.004 z3=5e-05 z4=-6e-06",
         ),
         ("GRINSUR3", "0.5 1.6", "1.6"),
+        ("GRINSU10", "0.5 1.6 0 -0.02 0 3e-4 0 -5e-6", "gradient 1.6 y2=-0.02 y4=0.0003 y6=-5e-06"),
+        (
+            "GRINSU12",
+            "0.5 2 1.6 0.1 0.2 0.3 0.4 0.5 0.6",
+            "gradient 1.6 x=0.1 y=0.2 z=0.3 x2=0.4 y2=0.5 z2=0.6",
+        ),
     ],
 )
 def test_parameters_are_terms(kind, parameters, material):
@@ -77,7 +84,14 @@ def test_a_rod_of_a_quarter_of_its_pitch_brings_parallel_light_to_its_end(tmp_pa
         (("GRINSUR3",), "PARM 2, the index at the vertex, must be positive, not 0"),
         (("GRINSUR1", "1", "1.6", "0", "3"), "PARM 4 is 3, but TYPE GRINSUR1 has PARM 1 to 3"),
         (("GRINSUR5", "1", "1.6", *("0",) * 6, "0.1"), "a tilted surface in front of a gradient"),
-        (("GRINSUR9", "1", "1.6"), "a gradient-index medium of this kind is not held"),
+        (("GRINSUR7", "1", "1.6"), "a gradient-index medium of this kind is not held"),
+        (("GRINSUR9", "1", "0.1"), "a tilted surface in front of a gradient"),
+        (("GRINSUR9", "1"), "TYPE GRINSUR9 needs GLAS, a gradient-index glass"),
+        (("GRINSU10", "1", "1.6", "0.1"), r"an odd power of \|y\| is not held"),
+        (
+            ("GRINSU12", "1", "1", "1.6", "0", "0", "0", "1"),
+            "polynomials are of order 1, but there is a coefficient of x2",
+        ),
         (("GRADIUM", "1"), "a gradient-index medium of this kind is not held"),
     ],
 )
@@ -89,3 +103,58 @@ def test_what_cannot_be_held_is_refused(given, message):
 def test_a_gradient_with_a_dispersion_of_its_own_is_refused():
     with pytest.raises(InputError, match=r"dispersion of its own is not held \(GLAS ___BLANK"):
         medium("GRINSUR5", "1", "1.6", more=(GLASS,))
+
+
+GLASSES = {
+    "GRADIENT_9.DAT": "SLW-1.8\n1.5868\n8.14E-3\n0.3238\n5.364E-3\n2.626E-4\n",
+    # n0 = 1.6 + 0.01 µm²/λ², n1 = -0.02 + 3e-3/λ² - 1e-4·λ² and n2 = 5e-4/λ⁴, λ in µm.
+    "GLC.DAT": "VERSION 1\nARS20\n"
+    + "\n".join(["1.6", "0", "1e4", "0", "-0.02", "-1e-10", "3e3", *["0"] * 4, "5e8", *["0"] * 8]),
+}
+
+
+def glass_line(name):
+    return (f"GLAS {name} 0 0 1.5 40 0 0 0 0 0 0",)
+
+
+def test_glasses_of_zemaxs_files_have_the_index_of_their_formulas(tmp_path):
+    for name, lines in GLASSES.items():
+        (tmp_path / name.lower()).write_text(lines)
+    u = 0.6**-2
+    n0, a = 1.5868 + 8.14e-3 * u, (0.3238 + 5.364e-3 * u + 2.626e-4 * u * u) ** 2
+    r2 = -0.02 + 3e-3 * u - 1e-4 / u
+    known = {
+        ("GRINSUR9", "slw-1.8"): lambda r: n0 * (1.0 - 0.5 * a * r * r),
+        ("GRINSUR6", "ARS20"): lambda r: 1.6 + 0.01 * u + r2 * r**2 + 5e-4 * u * u * r**4,
+    }
+    for (kind, glass), index in known.items():
+        file = tmp_path / f"{kind}.zmx"
+        file.write_text(text(kind, "0.5", more=glass_line(glass)))
+        lens = load_lens(file, glass_catalogues=tmp_path)
+        medium = lens.materials[1]
+        profile = medium.profile_at(medium.profile(), 600.0)
+        for r in (0.0, 0.7):
+            squared = profile.bend(medium.index(600.0), r, 0.0, 0.3).squared
+            assert float(squared) == pytest.approx(index(r) ** 2, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (None, "SLW-1.8 stands in Zemax's GRADIENT_9.DAT; name its folder"),
+        ("SLW-2.0\n1\n2\n3\n4\n5", "no glass SLW-1.8.*allowed: SLW-2.0"),
+        ("SLW-1.8\n1\n2\n3", "'SLW-1.8' has 3 numbers, not 5"),
+        ("SLW-1.8\n1\n2\nx\n4\n5", "line 4"),
+    ],
+)
+def test_a_glass_that_cannot_be_found_is_refused(tmp_path, lines, message):
+    if lines is not None:
+        (tmp_path / "GRADIENT_9.DAT").write_text(lines)
+    with glass_folders(tmp_path), pytest.raises(InputError, match=message) as caught:
+        medium("GRINSUR9", "1", more=glass_line("SLW-1.8"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_glass_of_millimetres_is_refused_in_a_file_of_inches(tmp_path):
+    with glass_folders(tmp_path), pytest.raises(InputError, match="is given in mm"):
+        medium("GRINSUR9", "1", more=glass_line("SLW-1.8"), head="FLOA\nUNIT IN\n")

@@ -15,7 +15,7 @@ GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
 BAD = {
     "superconic": (singlet("TYPE SUPERCON", *GOOD),
                    "surface 1: a superconic is not held (TYPE SUPERCON; allowed: "),
-    "gradient index": (singlet("TYPE GRINSUR6", *GOOD), "surface 1: a gradient-index medium of"),
+    "gradient index": (singlet("TYPE GRINSUR7", *GOOD), "surface 1: a gradient-index medium of"),
     "non-sequential part": (singlet("TYPE NONSEQCO", *GOOD, "NSCS 1 7 _NONE_"),
                             "surface 1: a non-sequential component is not held"),
     "Fresnel lens": (singlet("TYPE FRESNELS", *GOOD), "surface 1: a Fresnel surface is not held"),
