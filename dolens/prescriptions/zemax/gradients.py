@@ -7,17 +7,20 @@ for GRINSUR2), and the others are coefficients, in the file's unit of length.  G
 of |y|, of which even powers are held: the others have a kink on the axis.  GRINSU12 has the order
 of its polynomials in PARM 2 and the index in PARM 3; then come coefficients of x, y and z, of x²,
 y² and z², and so on.  GRINSUR6 and GRINSUR9 are glasses of a file (see
-`dolens.prescriptions.zemax.gradient_files`).
+`dolens.prescriptions.zemax.gradient_files`).  GRINSUR5 and GRINSUR9 add x·tan α + y·tan β to the
+sag, which is held for planes.
 
 Source: OpticStudio's help, "Gradient 1" to "Gradient 12".
 """
 
 import math
+from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.gradients import MOST_POWERS
 from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax.gradient_files import FILES, gradient_glass
+from dolens.prescriptions.zemax.table import ZemaxShape
 
 # TYPE → terms of PARM 3, PARM 4, ...
 GRADIENTS: dict[str, tuple[str, ...]] = {
@@ -34,19 +37,35 @@ GRADIENTS: dict[str, tuple[str, ...]] = {
     ),
 }
 _SQUARED, _ORDERED = "GRINSUR2", "GRINSU12"
-_TILTED = "a tilted surface in front of a gradient is not held"
 _KINKED = "an odd power of |y| is not held in a gradient"
 # TYPE → the slots of PARM that no medium holds, and what they are about.
 REFUSED = {
-    "GRINSUR5": dict.fromkeys(("PARM 9", "PARM 10"), _TILTED),
-    "GRINSUR9": dict.fromkeys(("PARM 2", "PARM 3"), _TILTED),
     "GRINSU10": dict.fromkeys(("PARM 3", "PARM 5", "PARM 7"), _KINKED),
 }
+# TYPE → the slots of the tangents of a tilt along x and y, which are added to the sag.
+TANGENTS = {"GRINSUR5": ("PARM 9", "PARM 10"), "GRINSUR9": ("PARM 2", "PARM 3")}
 # TYPE → the last slot of PARM that has a meaning.
 SLOTS = {
     **{kind: 2 + len(terms) + (kind == _ORDERED) for kind, terms in GRADIENTS.items()},
-    **dict.fromkeys(FILES, 1),
+    **{"GRINSUR5": 10, "GRINSUR6": 1, "GRINSUR9": 3},
 }
+
+
+def tilted_row(shape: ZemaxShape, block: SurfaceBlock) -> dict[str, Any]:
+    """Return the row of a surface in front of a gradient: a conic, or a tilted plane.
+
+    Raises:
+        InputError: a curved surface is tilted.
+    """
+    slots = TANGENTS.get(block.type, ())
+    tangents = {axis: block.slot(slot) for axis, slot in zip("xy", slots, strict=False)}
+    if not any(tangents.values()):
+        return shape.by_table(block)
+    if block.number("CURV"):
+        raise InputError(
+            f"{block.place}: a curved surface with a tilt is not held in front of a gradient"
+        )
+    return {"type": "xy_polynomial", **tangents}
 
 
 def gradient_medium(block: SurfaceBlock) -> str | None:

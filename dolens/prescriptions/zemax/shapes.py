@@ -21,7 +21,7 @@ from dolens.prescriptions.numbers import as_number, power_of
 from dolens.prescriptions.other_programs import ALWAYS, Number, monomials, powers_of_r
 from dolens.prescriptions.row_data import BREAK_KIND
 from dolens.prescriptions.zemax.file import SurfaceBlock, grid_lines, read_grid
-from dolens.prescriptions.zemax.gradients import REFUSED, SLOTS
+from dolens.prescriptions.zemax.gradients import REFUSED, SLOTS, tilted_row
 from dolens.prescriptions.zemax.table import (
     CONIC,
     ORDER,
@@ -404,7 +404,7 @@ SHAPES = {
                 base=CONIC,
                 others=_parm(*range(1, last + 1)),
                 refused=REFUSED.get(kind, {}),
-                own_read=None,
+                own_read=tilted_row,
             )
             for kind, last in SLOTS.items()
         ),

@@ -3,9 +3,11 @@
 import math
 
 import pytest
+import torch
 
-from dolens import InputError, load_lens
+from dolens import InputError, Rays, load_lens
 from dolens.optics.glass_catalog import glass_folders
+from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.files import check_file
 from dolens.prescriptions.zemax.reader import read_zemax
 from tests.prescriptions.zemax.samples import GLASS, singlet
@@ -83,9 +85,8 @@ def test_a_rod_of_a_quarter_of_its_pitch_brings_parallel_light_to_its_end(tmp_pa
     [
         (("GRINSUR3",), "PARM 2, the index at the vertex, must be positive, not 0"),
         (("GRINSUR1", "1", "1.6", "0", "3"), "PARM 4 is 3, but TYPE GRINSUR1 has PARM 1 to 3"),
-        (("GRINSUR5", "1", "1.6", *("0",) * 6, "0.1"), "a tilted surface in front of a gradient"),
+        (("GRINSUR5", "1", "1.6", *("0",) * 6, "0.1"), "a curved surface with a tilt is not held"),
         (("GRINSUR7", "1", "1.6"), "a gradient-index medium of this kind is not held"),
-        (("GRINSUR9", "1", "0.1"), "a tilted surface in front of a gradient"),
         (("GRINSUR9", "1"), "TYPE GRINSUR9 needs GLAS, a gradient-index glass"),
         (("GRINSU10", "1", "1.6", "0.1"), r"an odd power of \|y\| is not held"),
         (
@@ -158,3 +159,21 @@ def test_a_glass_that_cannot_be_found_is_refused(tmp_path, lines, message):
 def test_a_glass_of_millimetres_is_refused_in_a_file_of_inches(tmp_path):
     with glass_folders(tmp_path), pytest.raises(InputError, match="is given in mm"):
         medium("GRINSUR9", "1", more=glass_line("SLW-1.8"), head="FLOA\nUNIT IN\n")
+
+
+def test_the_polished_end_of_a_rod_is_a_tilted_plane(tmp_path):
+    # As a fibre's collimator has it: 8°, and light along the axis leaves it by Snell's law.
+    tangent, n = math.tan(math.radians(8.0)), 1.6
+    parameters = ("0", str(n), *("0",) * 6, "0", repr(tangent))
+    file = read_zemax(
+        text("GRINSUR5", *parameters, radius="0").replace("CURV -0.02", "CURV 0"), "a"
+    )
+    assert file.prescription["surfaces"]["1"]["type"] == "xy_polynomial"
+    lens = lens_from_prescription(file.prescription)
+    straight = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    hit = lens.trace(Rays(-straight, straight, 550.0), last=1)
+    normal = torch.tensor([0.0, -tangent, 1.0], dtype=torch.float64)
+    normal = normal / normal.norm()
+    # n·d - d₀ is along the normal.
+    jump = n * hit.direction.detach() - straight
+    assert float(jump.dot(normal)) == pytest.approx(float(jump.norm()), rel=1e-14)
