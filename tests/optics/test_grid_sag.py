@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from dolens import InputError, Rays, Status
+from dolens.optics.splines import spline_slopes
 from dolens.optics.surfaces import EvenAsphere, GridSag
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
@@ -163,3 +165,10 @@ def test_the_error_falls_with_the_fourth_power_of_the_spacing():
         found = GridSag.added_terms(parameters(surface), x, y)[0]
         errors.append(float((found - bump(x, y)).abs().max()))
     assert math.log2(errors[0] / errors[1]) > 3.5
+
+
+def test_slopes_of_splines_are_those_of_scipy_at_any_nodes():
+    nodes, values = np.array([0.0, 1.0, 1.5, 4.0, 4.2, 7.0]), np.arange(12.0).reshape(2, 6) ** 1.7
+    for count in (2, 3, 4, 6):
+        exact = CubicSpline(nodes[:count], values[:, :count], axis=1)(nodes[:count], 1)
+        np.testing.assert_allclose(spline_slopes(values[:, :count], nodes[:count]), exact)

@@ -13,6 +13,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.cubics import hermite
 from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.optics.splines import spline_slopes
 from dolens.optics.surfaces.base import PackedShape, Parameters, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.even_asphere import AsphereWithTerms, EvenAsphere, even_asphere
@@ -142,41 +143,15 @@ def with_slopes(parameters: Mapping[str, Any]) -> dict[str, Any]:
     values = sag.numpy()
 
     def along_y(array: np.ndarray) -> np.ndarray:
-        return spline_slopes(array.T, spacing[1]).T
+        return spline_slopes(array.T, spacing[1] * np.arange(len(array))).T
 
     if "slope_x" not in arrays:
-        given["slope_x"] = spline_slopes(values, spacing[0])
+        given["slope_x"] = spline_slopes(values, spacing[0] * np.arange(values.shape[1]))
     if "slope_y" not in arrays:
         given["slope_y"] = along_y(values)
     if "twist" not in arrays:
         given["twist"] = along_y(np.asarray(given["slope_x"], dtype=np.float64))
     return given
-
-
-def spline_slopes(values: np.ndarray, spacing: float) -> np.ndarray:
-    """Return the slopes along the last axis of the cubic spline through equally spaced values.
-
-    Second derivatives are continuous at every node, and third ones at the last but one from either
-    end, so that cubics are reproduced.  Two or three nodes have the polynomial through them.
-    Source: de Boor, A Practical Guide to Splines, ch. IV ("not-a-knot").
-
-    Args:
-        values: (..., n) with n ≥ 2.
-        spacing: of the nodes.
-    """
-    count = values.shape[-1]
-    step = np.diff(values, axis=-1) / spacing
-    if count == 2:
-        return np.concatenate([step, step], -1)
-    middle = 0.5 * (step[..., :-1] + step[..., 1:])
-    bend = step[..., 1:] - step[..., :-1]
-    if count == 3:
-        return np.concatenate([middle - bend, middle, middle + bend], -1)
-    system = np.diag(np.full(count, 4.0)) + np.eye(count, k=1) + np.eye(count, k=-1)
-    right = np.concatenate([-2.0 * bend[..., :1], 6.0 * middle, 2.0 * bend[..., -1:]], -1)
-    system[0], system[-1] = 0.0, 0.0
-    system[0, 0], system[0, 2], system[-1, -1], system[-1, -3] = 1.0, -1.0, 1.0, -1.0
-    return np.linalg.solve(system, right.reshape(-1, count).T).T.reshape(values.shape)
 
 
 class Cell(NamedTuple):
