@@ -18,13 +18,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.diffraction.element_waves import element_light, element_number
+from dolens.diffraction.element_cut import element_number
+from dolens.diffraction.element_waves import element_light
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.field_pupil import FieldPupil
 from dolens.diffraction.reference_sphere import chief_rays
 from dolens.diffraction.wavefront import pupil_wavefront
 from dolens.errors import InputError
-from dolens.optics.diffractive import relief_efficiencies
+from dolens.optics.autograd import replay
+from dolens.optics.diffractive import Relief, relief_efficiencies
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays
@@ -44,8 +46,8 @@ def light_goes_by_orders(system: OpticalSystem) -> bool:
     carried through the lens; if not, waves pass its only element.
 
     Raises:
-        InputError: waves cannot pass, as `element_number` says, and heights of pixels or rings have
-            no orders.
+        InputError: waves cannot pass, as `element_number` says, and pixels, rings and cells have no
+            orders.
     """
     try:
         element_number(system)
@@ -53,7 +55,7 @@ def light_goes_by_orders(system: OpticalSystem) -> bool:
         for number in system.diffractive:
             surface = system.surfaces[number - 1]
             assert surface.relief is not None
-            if surface.deflection is None or surface.relief.heights is not None:
+            if surface.deflection is None or surface.relief.values is not None:
                 raise InputError(f"{error}; orders are those of a 'phase' alone") from None
         return True
     return False
@@ -61,8 +63,9 @@ def light_goes_by_orders(system: OpticalSystem) -> bool:
 
 def element_flux(
     system: OpticalSystem, points: ObjectPoints, wavelengths: Tensor, centres: Tensor
-) -> Tensor:
-    """Return what passes of N points' light in all orders (N,), over an axial point's.
+) -> tuple[Tensor, Tensor]:
+    """Return what arrives of N points' light at elements (N,), over an axial point's, and the share
+    of it that leaves them in all orders, (N,), differentiable; cells alone keep some.
 
     Args:
         system: the lens.
@@ -71,8 +74,18 @@ def element_flux(
         centres: (N, 2), mm on the sensor.
     """
     if light_goes_by_orders(system):
-        return pupil_wavefront(system, points, wavelengths, centres, _RAYS).flux
-    return element_light(system, points, wavelengths, centres).fit.wavefront.flux
+        flux = pupil_wavefront(system, points, wavelengths, centres, _RAYS).flux
+        return flux, torch.ones_like(flux)
+    light = element_light(system, points, wavelengths, centres)
+    flux = light.fit.wavefront.flux
+    if not system.metasurfaces:
+        return flux, torch.ones_like(flux)
+    plans = [light.plan(n, 0.0) for n in range(len(light))]
+
+    def share(n: int, *tensors: Tensor) -> Tensor:
+        return light.with_tensors(tensors).passed_share(n, plans[n])[None]
+
+    return flux, replay(share, [1] * len(plans), light.tensors)
 
 
 class Order(NamedTuple):
@@ -105,7 +118,7 @@ def orders_of(system: OpticalSystem, points: ObjectPoints, wavelengths: Tensor) 
     chief = chief_rays(system, points, wavelengths)
     for number in system.diffractive:
         surface = system.surfaces[number - 1]
-        assert surface.deflection is not None and surface.relief is not None
+        assert surface.deflection is not None and isinstance(surface.relief, Relief)
         blaze = round(float(surface.deflection.parameters["order"]))
         sign = 1 if blaze > 0 else -1
         # Where M is high another wavelength has its light in an order far from M, up to 2M.

@@ -79,13 +79,15 @@ class ElementSpread:
             cells: M, along each side.
 
         Returns:
-            Means over the cells (M, M), share of the light per mm²; the highest irradiance, and
-            that of the same light if all of it met in phase at the centre, 1/mm².
+            Means over the cells (M, M), share of the light that leaves the element per mm²; the
+            highest irradiance, and that of the same light if all of it met in phase at the centre,
+            1/mm².
         """
         light = self.light
-        flux = light.fit.wavefront.flux.cpu()
-        share = self.weights.cpu() / (self.weights.cpu() @ flux)
         plans = [light.plan(n, half) for n in range(len(light))]
+        leaves = [light.passed_share(n, plan).cpu() for n, plan in enumerate(plans)]
+        flux = light.fit.wavefront.flux.cpu() * torch.stack(leaves)
+        share = self.weights.cpu() / (self.weights.cpu() @ flux)
         finest = max(plan.band for plan in plans)
         parts = max(1, min(math.ceil(2.0 * half / cells * finest * _STEPS), _MOST))
         fine = parts * cells

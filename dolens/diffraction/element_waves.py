@@ -19,6 +19,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.diffraction.element_cut import cut_at, element_number
+from dolens.diffraction.element_plan import (
+    Plan,
+    coarse,
+    lit_box,
+    phase_at,
+    plan_of,
+    slopes_at,
+    towards_centre,
+    turned_slopes,
+    turns_to,
+)
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.free_space import (
     Layer,
@@ -26,12 +38,10 @@ from dolens.diffraction.free_space import (
     by_fourier,
     by_spectrum,
     by_summation,
-    fourier_error,
     on_grid,
     reduced_distance,
-    to_centre,
 )
-from dolens.diffraction.propagation import DiffractionSettings
+from dolens.diffraction.propagation import DiffractionSettings, phasor
 from dolens.diffraction.pupil_fit import (
     PupilFit,
     RegularPupil,
@@ -43,64 +53,14 @@ from dolens.diffraction.radial_waves import MOST_BEYOND, beyond, by_radius
 from dolens.diffraction.reference_sphere import chief_ray_intercepts
 from dolens.diffraction.wavefront import MM_PER_NM, coverage, pupil_wavefront
 from dolens.errors import InputError
-from dolens.optics.diffractive import PhaseOnGrid, Relief, transmission
-from dolens.optics.surfaces.phase import Phase, RadialPhase
+from dolens.optics.diffractive import Relief, transmission
+from dolens.optics.metasurface import Cells
+from dolens.optics.surfaces.phase import RadialPhase
 from dolens.optics.surfaces.state import LawState
-from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
+from dolens.optics.system import OpticalSystem
 
 # Degree of the polynomials that rays are fitted by.
 _DEGREE = 10
-# Cells to a turn of the phase, to a ring or zone, by the settings' `oversampling` of two; fewest
-# and most cells along a side.
-_TWO, _FEWEST, _MOST = 2.0, 96, 4096
-# Of the settings' phase error, what one Fourier transform may make.
-_SHARE = 0.5
-# Points that say how steep phases are, and cells that find the light's edge, along each side.
-_COARSE, _SEARCH = 33, 128
-
-
-def element_number(system: OpticalSystem) -> int:
-    """Return the number of the surface whose relief waves pass, the only one.
-
-    Raises:
-        InputError: one line that says which of the conditions of this module a lens does not meet.
-    """
-    what = "diffractive element"
-    found = system.diffractive
-    if len(found) != 1:
-        raise InputError(f"{what}: waves pass one, and there are {len(found)}: surfaces {found}")
-    number = found[0]
-    require_refracting(system, what)
-    require_plane_sensor(system, what)
-    if system.stop > number:
-        raise InputError(f"{what}: the stop, surface {system.stop}, stands behind surface {number}")
-    if any(element.last >= number for element in system.elements):
-        raise InputError(f"{what}: surface {number}, or one behind it, belongs to a moved element")
-    kind = system.surfaces[number - 1].shape.kind
-    if kind not in ("plane", "aperture"):
-        raise InputError(f"{what}: surface {number} is no plane, but a {kind}")
-    for at in range(number + 1, len(system.surfaces) + 1):
-        surface = system.surfaces[at - 1]
-        if surface.shape.kind not in ("plane", "aperture") or surface.deflection is not None:
-            raise InputError(
-                f"{what}: surface {at} behind surface {number} is no plane; waves go from an "
-                "element to the sensor through plane plates only (rays' order alone: `phase`)"
-            )
-    return number
-
-
-def cut_at(system: OpticalSystem, number: int) -> OpticalSystem:
-    """Return a lens that ends on one of its surfaces, which refracts and does nothing else."""
-    surfaces = [*system.surfaces[: number - 1]]
-    surfaces.append(replace(system.surfaces[number - 1], deflection=None, relief=None))
-    return replace(
-        system,
-        surfaces=surfaces,
-        thicknesses=list(system.thicknesses[: number - 1]),
-        sensor_distance=torch.zeros_like(system.sensor_distance),
-        materials=system.materials[: number + 1],
-        index_offsets=tuple(system.index_offsets[: number + 1]),
-    )
 
 
 @dataclass(frozen=True)
@@ -109,7 +69,7 @@ class ElementLight:
 
     Attributes:
         fit: of paths and amplitudes, in mm on the element in the place of direction cosines.
-        relief: of the element.
+        relief: of the element, or its cells.
         law: of its phase, or None.
         thicknesses: of the media behind the element, to the sensor, mm.
         number: of the surface.
@@ -119,7 +79,7 @@ class ElementLight:
     """
 
     fit: PupilFit
-    relief: Relief
+    relief: Relief | Cells
     law: LawState | None
     thicknesses: tuple[Tensor, ...]
     number: int
@@ -138,7 +98,7 @@ class ElementLight:
         found = [self.fit.coefficients, *self.thicknesses]
         found += [s.edge for s in clipping if s.edge is not None]
         found += [] if self.law is None else self.law.parameters.values()
-        return found + ([] if self.relief.heights is None else [self.relief.heights])
+        return found + ([] if self.relief.values is None else [self.relief.values])
 
     def with_tensors(self, values: Sequence[Tensor]) -> "ElementLight":
         """Return the same light with other tensors."""
@@ -152,7 +112,7 @@ class ElementLight:
         law = self.law
         if law is not None:
             law = replace(law, parameters={name: left.pop(0) for name in law.parameters})
-        relief = replace(self.relief, heights=left.pop(0)) if left else self.relief
+        relief = self.relief.with_values(left.pop(0)) if left else self.relief
         fit = replace(
             self.fit,
             coefficients=coefficients,
@@ -171,82 +131,14 @@ class ElementLight:
     def _behind(self) -> range:
         return range(self.number, len(self.system.materials))
 
-    @torch.no_grad()
-    def plan(self, n: int, half_window: float) -> "Plan":
-        """Return method, grid and errors of one point's light.
-
-        Args:
-            n: number of the point.
-            half_window: mm, from the window's centre to its sides.
-
-        Raises:
-            InputError: more cells are needed than can be computed.
-        """
-        fit, relief, settings = self.fit, self.relief, self.settings
-        low, high = self._lit(n)
-        wavelength, layers = float(fit.wavefront.wavelength[n]), self.layers(n)
-        wave, centre = MM_PER_NM * wavelength, self.centre[n].tolist()
-        x, y = _coarse(low, high)
-        error = math.inf
-        if len(layers) == 1:
-            error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
-        method = settings.method
-        if method == "auto":
-            method = "fourier" if error <= _SHARE * settings.phase_error else "spectrum"
-        if method != "spectrum" and len(layers) > 1:
-            raise InputError(f"method {method}: there are plates behind; allowed: spectrum")
-        slopes = torch.stack(_slopes(fit, n, x, y))
-        behind, lit = self._turned(n, x, y)
-        carrier = slopes[:, lit].mean(-1)
-        towards = _towards(x, y, centre, layers)
-        left = behind - (towards if method == "fourier" else carrier[:, None, None])
-        turned = behind - slopes
-        if self.law is not None:
-            turned = turned / round(float(self.law.parameters["order"]))
-        steepest = float(torch.where(lit, torch.maximum(left.abs(), turned.abs()), 0.0).max())
-        width = float((high - low).max())
-        cells = _TWO * settings.oversampling
-        finest = min(wave / (cells * max(steepest, 1e-12)), width / (settings.samples or _FEWEST))
-        cell = finest
-        if relief.heights is not None:
-            own = relief.pitch if relief.pixelated else relief.pitch / cells
-            cell = own / max(1, math.ceil(own / finest - 1e-9))
-        count = math.ceil(width / cell) + 2
-        if count > _MOST:
-            raise InputError(
-                f"diffractive element: {count} cells of {1e3 * cell:.3g} µm across the light are "
-                f"needed, more than {_MOST}; a slower beam or larger pixels need fewer"
-            )
-        starts = []
-        for axis in (0, 1):
-            half = 0.0
-            if relief.heights is not None and relief.pixelated:
-                # Edges of pixels fall on edges of cells.
-                half = 0.5 * relief.pitch * relief.heights.shape[1 - axis]
-            middle = 0.5 * float(low[axis] + high[axis])
-            starts.append(round((middle + half) / cell - 0.5 * count) * cell - half)
-        reach = width + 2.0 * half_window
-        band = min(1.0 / cell, reach / (wave * float(reduced_distance(layers))))
-        tilt = float(carrier[0]), float(carrier[1])
-        return Plan(method, error, cell, count, (starts[0], starts[1]), tilt, band)
-
-    def _lit(self, n: int) -> tuple[Tensor, Tensor]:
-        """Return the corners (2,) of a box that holds the light of a point, mm; no gradient."""
-        low, high = self.fit.low[n], self.fit.high[n]
-        side = (high - low).amax() / _SEARCH
-        start = float(low[0]), float(low[1])
-        plan = Plan("", 0.0, float(side), _SEARCH, start, (0.0, 0.0), 0.0)
-        lit = self._pupil(n, plan, (0.0, 0.0), torch.float64).amplitude[0] > 0.0
-        if not bool(lit.any()):
-            return low, high
-        ends = [lit.any(dim).nonzero().flatten()[[0, -1]] for dim in (0, 1)]
-        first, last = torch.stack(ends).to(low).unbind(1)
-        return low + side * (first - 1.0), low + side * (last + 2.0)
+    def plan(self, n: int, half_window: float) -> Plan:
+        """Return method, grid and errors of one point's light; see `plan_of`."""
+        return plan_of(self, n, half_window)
 
     @torch.no_grad()
     def f_number(self, n: int) -> float:
         """Return the reduced distance to the sensor over the width of a point's light."""
-        low, high = self._lit(n)
+        low, high = lit_box(self, n)
         return float(reduced_distance(self.layers(n))) / float((high - low).max())
 
     @torch.no_grad()
@@ -254,9 +146,9 @@ class ElementLight:
         """Return how far from the window's centre rays' order lands, mm: √2 of the RMS, which is
         the edge of an even disc.
         """
-        low, high = self._lit(n)
-        x, y = _coarse(low, high)
-        slopes, lit = self._turned(n, x, y)
+        low, high = lit_box(self, n)
+        x, y = coarse(low, high)
+        slopes, lit = turned_slopes(self, n, x, y)
         spread = torch.zeros((), dtype=torch.float64)
         ways = [(x - self.centre[n, 0])[None].expand_as(lit), (y - self.centre[n, 1])[:, None]]
         for layer in self.layers(n):
@@ -269,28 +161,35 @@ class ElementLight:
             spread = spread + way[lit].square().mean()
         return math.sqrt(2.0 * float(spread))
 
-    def _turned(self, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return n·sin of rays' order behind the element (2, Y, X), and where light may be."""
-        slopes = torch.stack(_slopes(self.fit, n, x, y))
-        inside = (x[None] - x.mean()).square() / (x[-1] - x.mean()).square()
-        inside = inside + ((y - y.mean()).square() / (y[-1] - y.mean()).square())[:, None]
-        if self.law is not None:
-            phase = _phase(self.law, x, y)
-            wave = MM_PER_NM * float(self.fit.wavefront.wavelength[n])
-            slopes = slopes + torch.stack(phase[1:3]) * (wave / (2.0 * math.pi))
-        return slopes, inside <= 1.0
-
     @torch.no_grad()
-    def perfect(self, n: int, plan: "Plan") -> float:
+    def perfect(self, n: int, plan: Plan) -> float:
         """Return the irradiance, 1/mm², if all light of a point met in phase at the centre."""
-        pupil = self._pupil(n, plan, (0.0, 0.0), torch.float64)
+        pupil = self.pupil(n, plan, (0.0, 0.0), torch.float64)
         far = reduced_distance(self.layers(n))
         x, y = (at - c for at, c in zip(pupil.cosines[0], self.centre[n], strict=True))
         gain = far / (x.square()[None] + y.square()[:, None] + far * far)
         wave = MM_PER_NM * float(self.fit.wavefront.wavelength[n])
-        return float(((pupil.amplitude[0] * gain).sum() * plan.cell**2 / wave).square())
+        amplitude = pupil.amplitude[0] * self._passed_by_cells(n, pupil)
+        return float(((amplitude * gain).sum() * plan.cell**2 / wave).square())
 
-    def field(self, n: int, plan: "Plan", u: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
+    def passed_share(self, n: int, plan: Plan) -> Tensor:
+        """Return the share of a point's flux that leaves the element; a relief passes all."""
+        if isinstance(self.relief, Relief):
+            return torch.ones((), dtype=torch.float64)
+        pupil = self.pupil(n, plan, (0.0, 0.0), torch.float64)
+        flux = pupil.amplitude[0].square()
+        passed = (flux * self._passed_by_cells(n, pupil).square()).sum()
+        return passed / flux.sum().clamp(min=1e-30)
+
+    def _passed_by_cells(self, n: int, pupil: RegularPupil) -> Tensor:
+        """Return the magnitude of what cells pass on a pupil's grid; 1 of a relief."""
+        if isinstance(self.relief, Relief):
+            return torch.ones((), dtype=torch.float64)
+        x, y = pupil.cosines[0]
+        wavelength = float(self.fit.wavefront.wavelength[n])
+        return self.relief.transmission(x, y, wavelength).abs()
+
+    def field(self, n: int, plan: Plan, u: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the field (V, U) of a point in its window; |U|² is flux per mm².
 
         Args:
@@ -328,7 +227,7 @@ class ElementLight:
         edge, reach = float(self.fit.high[n].max()), math.sqrt(2.0) * half_window
         return beyond(edge, reach, behind[0], wavelength) <= MOST_BEYOND
 
-    def radial(self, n: int, plan: "Plan", rho: Tensor, dtype: torch.dtype) -> Tensor:
+    def radial(self, n: int, plan: Plan, rho: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the field (P,) of a point on the axis at distances from it, mm; see `one_radius`.
 
         Args:
@@ -354,7 +253,7 @@ class ElementLight:
         values = self._passed(n, r, rows[1:2], turns, dtype) * amplitude.to(dtype)
         return by_radius(values[0], r, layer, wavelength, rho)
 
-    def behind(self, n: int, plan: "Plan", dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    def behind(self, n: int, plan: Plan, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
 
         The phase is less the carrier's tilt; for the method `fourier` it is that of the field times
@@ -366,17 +265,17 @@ class ElementLight:
         steps = (torch.arange(plan.count).to(self.centre) + 0.5) * plan.cell
         x, y = steps + plan.start[0], steps + plan.start[1]
         fourier = plan.method == "fourier"
-        pupil = self._pupil(n, plan, (0.0, 0.0) if fourier else plan.carrier, dtype)
+        pupil = self.pupil(n, plan, (0.0, 0.0) if fourier else plan.carrier, dtype)
         turns, amplitude = pupil.opd[0], pupil.amplitude[0]
         if fourier:
             turns = turns + on_grid(
-                lambda x, y: _turns_to(x, y, layers[0], centre, wavelength), x, y, dtype
+                lambda x, y: turns_to(x, y, layers[0], centre, wavelength), x, y, dtype
             )
 
         def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
             gain = torch.ones((), dtype=torch.float64)
-            towards = _towards(x, y, centre, layers)
-            for slope, to in zip(_slopes(self.fit, n, x, y), towards, strict=True):
+            towards = towards_centre(x, y, centre, layers)
+            for slope, to in zip(slopes_at(self.fit, n, x, y), towards, strict=True):
                 gain = gain * torch.sinc((to - slope) * (width / wave))
             return gain
 
@@ -401,24 +300,26 @@ class ElementLight:
         dtype: torch.dtype,
         share: Tensor | None = None,
     ) -> Tensor:
-        """Return the phasors (Y, X) of light behind the relief that arrives with phases (Y, X)."""
-        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
+        """Return the phasors (Y, X) of light behind the element that arrives with phases (Y, X)."""
         wavelength = float(self.fit.wavefront.wavelength[n])
+        if isinstance(self.relief, Cells):
+            return self.relief.transmission(x, y, wavelength, dtype) * phasor(turns, dtype)
+        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
         inside, around = self.relief.indices(front, after, wavelength)
 
         def path(x: Tensor, y: Tensor) -> Tensor:
-            slope_x, slope_y = _slopes(self.fit, n, x, y)
+            slope_x, slope_y = slopes_at(self.fit, n, x, y)
             square = slope_x.square() + slope_y.square()
             normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
             return (next(normal) - next(normal)) / wavelength
 
-        phase = None if self.law is None else _phase(self.law, x, y)
+        phase = None if self.law is None else phase_at(self.law, x, y)
         turns = (turns - turns.detach().round()).to(dtype)
         given = on_grid(path, x, y, dtype), (front, after), phase, share, turns
         return transmission(self.relief, x, y, *given).to(dtype.to_complex())
 
-    def _pupil(
-        self, n: int, plan: "Plan", carrier: tuple[float, float], dtype: torch.dtype
+    def pupil(
+        self, n: int, plan: Plan, carrier: tuple[float, float], dtype: torch.dtype
     ) -> RegularPupil:
         """Return amplitude and path (in turns, less a carrier's tilt) on a plan's grid."""
         fit, wave = self.fit, MM_PER_NM * float(self.fit.wavefront.wavelength[n])
@@ -451,37 +352,6 @@ class ElementLight:
         )
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How the light of one point is computed.
-
-    Attributes:
-        method: `fourier`, `spectrum` or `direct`.
-        phase_error: waves, that `fourier` errs by at most; infinite behind plates.
-        cell: mm, of the grid on the element.
-        count: cells along each side.
-        start: mm, x and y where the grid begins.
-        carrier: tilt of the light that is taken out, n·sin.
-        band: cycles/mm, width of the field's band in the window.
-    """
-
-    method: str
-    phase_error: float
-    cell: float
-    count: int
-    start: tuple[float, float]
-    carrier: tuple[float, float]
-    band: float
-
-    @property
-    def reason(self) -> str:
-        """Return the choice in words."""
-        return (
-            f"{self.method}: {self.count} × {self.count} cells of {1e3 * self.cell:.3g} µm on a "
-            f"diffractive element; one Fourier transform errs by {self.phase_error:.2g} waves"
-        )
-
-
 def element_light(
     system: OpticalSystem,
     points: ObjectPoints,
@@ -500,7 +370,8 @@ def element_light(
         settings: how finely; None: the default.
 
     Raises:
-        InputError: no element, or one that waves cannot pass as `element_number` says.
+        InputError: no element, one that waves cannot pass as `element_number` says, or cells whose
+            table does not hold their widths or the wavelengths.
     """
     settings = settings or DiffractionSettings()
     system = system.double()
@@ -518,6 +389,8 @@ def element_light(
         cut_at(system, number), points, waves, middle, settings.rays, on_sensor=True
     )
     surface = system.surfaces[number - 1]
+    if isinstance(surface.relief, Cells):
+        surface.relief.check(waves.tolist(), f"surface {number}")
     gaps = (*system.thicknesses, system.sensor_distance)[number - 1 :]
     assert surface.relief is not None
     return ElementLight(
@@ -530,46 +403,3 @@ def element_light(
         centre,
         settings,
     )
-
-
-def _coarse(low: Tensor, high: Tensor) -> list[Tensor]:
-    """Return columns and rows of a few points between corners (2,)."""
-    ends = zip(low.tolist(), high.tolist(), strict=True)
-    return [torch.linspace(a, b, _COARSE).to(low) for a, b in ends]
-
-
-def _slopes(fit: PupilFit, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return ∂OPD/∂x and ∂OPD/∂y (Y, X), the wavevector along the element over 2π/λ."""
-    table = fit.coefficients[n, 0]
-    degree = table.shape[-1] - 1
-    (a, da), (b, db) = (
-        [t[0] for t in chebyshev(((at.flatten() - middle) / half).clamp(-1.0, 1.0)[None], degree)]
-        for at, middle, half in zip((x, y), fit.centre[n], fit.half_width[n], strict=True)
-    )
-    half = fit.half_width[n]
-    return (b.mT @ table @ da) / half[0], (db.mT @ table @ a) / half[1]
-
-
-def _turns_to(
-    x: Tensor, y: Tensor, layer: Layer, centre: Sequence[float], wavelength: float
-) -> Tensor:
-    """Return n·(R - z)/λ of places to a window's centre, as `to_centre` has it."""
-    return to_centre(x.flatten(), y.flatten(), layer, centre, wavelength)[0]
-
-
-def _phase(law: LawState, x: Tensor, y: Tensor) -> PhaseOnGrid:
-    """Return the phase of rays' order on a grid (Y, X)."""
-    kind = law.law
-    assert issubclass(kind, Phase)
-    rows, columns = torch.meshgrid(y, x, indexing="ij")
-    found = kind.phase_and_gradient(law.parameters, columns, rows)
-    return PhaseOnGrid(*found, round(float(law.parameters["order"].detach())))
-
-
-def _towards(x: Tensor, y: Tensor, centre: Sequence[float], layers: Sequence[Layer]) -> Tensor:
-    """Return n·sin of the way from columns x and rows y to a window's centre, (2, Y, X)."""
-    far, index = reduced_distance(layers), layers[0].index if len(layers) == 1 else 1.0
-    across, down = (c - at.flatten() for c, at in zip(centre, (x, y), strict=True))
-    across, down = torch.broadcast_tensors(across[None], down[:, None])
-    distance = (across.square() + down.square() + (far * index) ** 2).sqrt()
-    return index * torch.stack((across, down)) / distance

@@ -30,6 +30,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.materials import Medium
+from dolens.optics.pixels_and_rings import on_pixels, on_rings
 
 _TURN = 2.0 * math.pi
 # Where no design wavelength says which of two media is the denser.
@@ -80,6 +81,15 @@ class Relief:
     fill: float = 1.0
     etch_scale: float = 1.0
     etch_errors: tuple[float, ...] = ()
+
+    @property
+    def values(self) -> Tensor | None:
+        """Return the heights, which may be varied."""
+        return self.heights
+
+    def with_values(self, values: Tensor) -> "Relief":
+        """Return the same relief with other heights."""
+        return replace(self, heights=values)
 
     @property
     def pixelated(self) -> bool:
@@ -136,19 +146,6 @@ class Relief:
         return total
 
 
-def designed_heights(relief: Relief, x: Tensor, y: Tensor) -> Tensor:
-    """Return pixels' heights (nm) on a grid of columns x (X,) and rows y (Y,), mm: (Y, X)."""
-    assert relief.heights is not None and relief.pixelated
-    rows, columns = relief.heights.shape
-    found = relief.heights
-    for dim, (at, count) in enumerate(((y, rows), (x, columns))):
-        place = (at / relief.pitch + 0.5 * count).floor()
-        inside = (place >= 0.0) & (place < count)
-        found = found.index_select(dim, place.clamp(0, count - 1).long())
-        found = found * inside.to(found).unsqueeze(1 - dim)
-    return found
-
-
 def transmission(
     relief: Relief,
     x: Tensor,
@@ -182,11 +179,12 @@ def transmission(
     if phase is not None:
         height, share, beyond = _blazed(relief, phase, media, cell)
     elif relief.heights is not None and not relief.pixelated:
-        height, share, beyond = _rings(relief, x, y, cell)
+        height, share, beyond = on_rings(relief.heights, relief.pitch, x, y, cell)
     else:
         height, share, beyond = torch.zeros_like(y[:, None] * x), None, None
-    if relief.pixelated or (phase is not None and relief.heights is not None):
-        own = designed_heights(relief, x, y) if relief.pixelated else _rings(relief, x, y, cell)[0]
+    if relief.heights is not None and (relief.pixelated or phase is not None):
+        given = relief.heights, relief.pitch, x, y
+        own = on_pixels(*given) if relief.pixelated else on_rings(*given, cell)[0]
         height, beyond = height + own, None if beyond is None else beyond + own
     turned = turns_of(height)
     if share is not None and beyond is not None:
@@ -240,19 +238,6 @@ def _blazed(
     distance = (turns - zone * (turns.detach() / zone).round()) / width.clamp(min=_TINY)
     beyond = torch.where(distance.detach() >= 0.0, per_turn * zone, -per_turn * zone)
     return height, (0.5 - distance.abs()).clamp(min=0.0), height + beyond
-
-
-def _rings(relief: Relief, x: Tensor, y: Tensor, cell: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the heights of rings, and share and height beyond the edge of one, as `_blazed`."""
-    assert relief.heights is not None
-    count, r = len(relief.heights), torch.hypot(x[None], y[:, None])
-    padded = torch.cat((relief.heights, relief.heights.new_zeros(1)))
-    ring, border = (r / relief.pitch).floor(), (r / relief.pitch).round()
-    other = torch.where(border > ring, ring + 1.0, ring - 1.0)
-    inner, outer = (padded[k.clamp(0, count).long()] for k in (ring, other))
-    width = (x[None].abs() + y[:, None].abs()) / r.clamp(min=_TINY) * cell
-    distance = (r - relief.pitch * border).abs() / width.clamp(min=_TINY)
-    return inner, (0.5 - distance).clamp(min=0.0), outer
 
 
 def _filled(relief: Relief, at: Tensor, cell: float, count: int) -> Tensor:
@@ -350,10 +335,12 @@ def order_efficiencies(
     law = system.surfaces[number - 1].deflection
     if law is None:
         raise InputError(f"lens '{lens.name}': surface {number} has no 'phase', and so no orders")
+    if not isinstance(relief := system.surfaces[number - 1].relief, Relief):
+        raise InputError(f"lens '{lens.name}': surface {number} has cells, which have no orders")
     waves = wavelengths or lens.wavelengths or (lens.primary_wavelength,)
     media = system.materials[number - 1], system.materials[number]
     blaze = round(float(law.parameters["order"].detach()))
-    return relief_efficiencies(system.surfaces[number - 1].relief, orders, waves, media, blaze)
+    return relief_efficiencies(relief, orders, waves, media, blaze)
 
 
 def lens_phase(

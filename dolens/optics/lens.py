@@ -23,6 +23,7 @@ from dolens.optics.lens_data import LensData
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.materials import MIRROR, Medium, media_of
+from dolens.optics.metasurface import Metasurface
 from dolens.optics.paraxial import vergence
 from dolens.optics.paraxial_rays import ideal_lenses, reversals, with_vergences
 from dolens.optics.polarisation import PolarisedRays, trace_polarised
@@ -66,6 +67,7 @@ def check_lens(
         if surface.law is not None and medium is MIRROR:
             raise InputError(f"surface {number}: a {surface.law.kind} cannot be a mirror")
     check_crystals(surfaces, media)
+    check_metasurfaces(surfaces)
     check_elements(elements, count)
     if all(surface.changes_axes for surface in surfaces):
         raise InputError("there is no surface but coordinate breaks")
@@ -99,6 +101,16 @@ def check_crystals(surfaces: Sequence[Surface], media: Sequence[Medium]) -> None
         if held is not None:
             raise InputError(
                 f"surface {number}: the face of a crystal is ideal, and cannot have a {held}"
+            )
+
+
+def check_metasurfaces(surfaces: Sequence[Surface]) -> None:
+    """Raise `InputError` where a surface has cells of a metasurface and a coating."""
+    for number, surface in enumerate(surfaces, 1):
+        if isinstance(surface.diffractive, Metasurface) and surface.coating is not None:
+            raise InputError(
+                f"surface {number}: cannot have a 'coating'; the table of its cells says what "
+                "passes"
             )
 
 

@@ -46,7 +46,7 @@ from dolens.optics.elements import to_lens_axes
 from dolens.optics.materials import is_anisotropic
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.surfaces.deflection import Vector
-from dolens.optics.system import OpticalSystem, require_homogeneous
+from dolens.optics.system import OpticalSystem, require_homogeneous, require_no_metasurface
 from dolens.optics.thin_films import Parts
 from dolens.optics.trace import (
     Crossing,
@@ -142,10 +142,11 @@ def trace_polarised(system: OpticalSystem, rays: Rays) -> PolarisedRays:
         rays: as users give them.
 
     Raises:
-        InputError: a coating that is a table of shares, which has no phases, or a medium that is
-            a gradient.
+        InputError: a coating that is a table of shares, which has no phases, a medium that is a
+            gradient, or cells of a metasurface.
     """
     require_homogeneous(system, "polarised rays")
+    require_no_metasurface(system, "polarised rays")
     ray, before = enter_lens(system, rays, 1, 1.0)
     crossings: list[Crossing] = []
     wavelength = rays.wavelength

@@ -27,6 +27,7 @@ from dolens.optics.crystals import Crystal, turned_axis
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.gradients import Gradient, Profile
 from dolens.optics.materials import Medium, absorption, is_anisotropic
+from dolens.optics.metasurface import Cells
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.coordinate_break import GlobalAxes, broken_axes
 from dolens.optics.surfaces.deflection import Law
@@ -124,8 +125,15 @@ class OpticalSystem:
 
     @cached_property
     def diffractive(self) -> tuple[int, ...]:
-        """Return the numbers of the surfaces with a relief, which waves see and rays do not."""
+        """Return the numbers of the surfaces with a relief or cells, which waves see and rays do
+        not.
+        """
         return tuple(n for n, s in enumerate(self.surfaces, 1) if s.relief is not None)
+
+    @cached_property
+    def metasurfaces(self) -> tuple[int, ...]:
+        """Return the numbers of the surfaces with cells."""
+        return tuple(n for n, s in enumerate(self.surfaces, 1) if isinstance(s.relief, Cells))
 
     def uncoated(self) -> "OpticalSystem":
         """Return the same lens, whose surfaces are ideal."""
@@ -504,8 +512,8 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
                 tensors += surface.deflection.parameters.values()
             if surface.coating is not None:
                 tensors += surface.coating.tensors
-            if surface.relief is not None and surface.relief.heights is not None:
-                tensors.append(surface.relief.heights)
+            if surface.relief is not None and surface.relief.values is not None:
+                tensors.append(surface.relief.values)
     for element in system.elements:
         tensors += element.parameters.values()
     for profile in system.profiles.values():
@@ -568,13 +576,23 @@ def require_plane_sensor(system: OpticalSystem, what: str) -> None:
 
 
 def require_seen_by_rays(system: OpticalSystem, what: str) -> None:
-    """Raise `InputError` where an element of a lens has heights and no phase; arguments as above.
+    """Raise `InputError` where an element of a lens has no phase; arguments as above.
 
-    Rays follow an element's phase in one order; heights of pixels or rings alone bend none.
+    Rays follow an element's phase in one order; heights or cells alone bend none.
     """
     for number in system.diffractive:
         if system.surfaces[number - 1].deflection is None:
+            name = "cells" if number in system.metasurfaces else "heights"
             raise InputError(
-                f"{what}: surface {number} is diffractive by its heights alone, which rays do not "
+                f"{what}: surface {number} is diffractive by its {name} alone, which rays do not "
                 "see; waves do (lens.psf, lens.mtf, renderer psf with diffraction: wave)"
             )
+
+
+def require_no_metasurface(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where a lens has cells of a metasurface; arguments as above."""
+    for number in system.metasurfaces:
+        raise InputError(
+            f"{what}: surface {number} has cells, whose table is one transmission for all "
+            "polarisations"
+        )

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from dolens.errors import InputError, check_keys
 from dolens.optics.autograd import jacobian_of
 from dolens.optics.lens import Lens
+from dolens.optics.metasurface import width_limits
 from dolens.optics.parameter_names import to_file_units, to_lens_units, unit_factors, unit_of
 from dolens.optimize.pickups_and_solves import Dependent, dependent, of_each_state
 from dolens.typed_values import check_type
@@ -29,7 +30,8 @@ class DesignVariables(nn.Module):
     such parameters out.
 
     Settings are in the units of files, degrees for tilts (see `dolens.optics.parameter_names`); θ
-    is in the lens's own units, radians and mm.
+    is in the lens's own units, radians and mm.  Widths of a metasurface's cells are also within the
+    limits of their table.
 
     Args:
         lens: where the parameters live; it is not changed.
@@ -78,6 +80,7 @@ class DesignVariables(nn.Module):
         self.dependents, self.focused = _dependents(lens, variables)
         following = {parameter.name for parameter in self.dependents} | self.focused
         scaled, scale, lower, upper = [], [], [], []
+        limits = width_limits(lens)
         for pattern, settings in variables.items():
             settings = dict(settings or {})
             if pattern in following:
@@ -97,6 +100,8 @@ class DesignVariables(nn.Module):
                 ]
                 low = _setting(settings, "lower", -math.inf, pattern)
                 high = _setting(settings, "upper", math.inf, pattern)
+                least, most = limits.get(name, (-math.inf, math.inf))
+                low, high = max(low, least), min(high, most)
                 if not 0.0 < s < math.inf:
                     raise InputError(f"variable '{name}': scale must be positive, not {s:g}")
                 for start in starts:

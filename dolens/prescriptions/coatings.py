@@ -38,7 +38,7 @@ from dolens.optics.coatings import (
     quarter_wave,
 )
 from dolens.optics.glass import Environment
-from dolens.optics.lens import Lens, check_crystals
+from dolens.optics.lens import Lens, check_crystals, check_metasurfaces
 from dolens.optics.materials import (
     MIRROR,
     IndexModel,
@@ -48,6 +48,7 @@ from dolens.optics.materials import (
     media_of,
     parse_material,
 )
+from dolens.optics.metasurface import Metasurface
 from dolens.optics.surfaces import Surface
 from dolens.prescriptions.numbers import as_number, as_positive
 from dolens.prescriptions.row_data import environment_of
@@ -153,7 +154,8 @@ def coatings_for(
 ) -> Iterator[tuple[int, Coating | None]]:
     """Yield the numbers of those surfaces that a coating of the whole lens holds for, and theirs.
 
-    It holds for refracting surfaces; those between two glasses are cemented, and bare.
+    It holds for refracting surfaces; those between two glasses are cemented, and bare.  A table of
+    cells says itself what passes.
 
     Args:
         surfaces: of the lens.
@@ -169,6 +171,8 @@ def coatings_for(
     for number in numbers:
         surface, before, behind = surfaces[number - 1], media[number - 1], media[number]
         if surface.changes_axes or surface.law is not None or before == behind:
+            continue
+        if isinstance(surface.diffractive, Metasurface):
             continue
         found = coating_from(value, place, model, air, dtype)
         check_coating(found, behind, place)
@@ -216,6 +220,7 @@ def coated(lens: Lens, coating: Any) -> Lens:
 def _check_faces(surfaces: Sequence[Surface], media: Sequence[Medium], where: str) -> None:
     try:
         check_crystals(surfaces, media)
+        check_metasurfaces(surfaces)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

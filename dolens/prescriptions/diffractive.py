@@ -8,6 +8,10 @@ be given by its heights (nm) as well, or be both in sum::
     '2': {type: plane, ..., diffractive: {pixels: [[0, 350], [700, 0]], pitch: 0.002, fill: 0.95}}
     '3': {type: plane, ..., diffractive: {rings: [0, 550, 0, 550], pitch: 0.01, material: 1.5}}
 
+A plane may have cells of a metasurface instead, whose table is a file or rows (see cells.py)::
+
+    '4': {type: plane, ..., diffractive: {cells: pillars.csv, pitch: 0.0004, widths: [[90, 120]]}}
+
 The rows of `pixels` run along y and its columns along x, both rising, about the vertex; `rings` go
 from the vertex outwards.  `pitch` (mm) is theirs.  Heights are taken modulo `depth` (nm), which of
 a design wavelength follows from it.  `material` is that of the relief, in air or in the rarer of
@@ -24,13 +28,15 @@ from dolens.errors import InputError, check_keys
 from dolens.optics.diffractive import VISIBLE, DiffractiveElement, Relief
 from dolens.optics.glass import Environment
 from dolens.optics.materials import MIRROR, IndexModel, Medium, parse_material
+from dolens.optics.metasurface import Metasurface
 from dolens.optics.surfaces.base import Surface, tensor_of
+from dolens.prescriptions.cells import TABLE_KEY, metasurface_from, metasurface_row
 from dolens.prescriptions.numbers import as_integer, as_number, as_numbers, require_mapping
 
 DIFFRACTIVE_KEY = "diffractive"
 _ARRAYS = {"pixels": 2, "rings": 1}
 _NUMBERS = ("design_wavelength", "depth", "pitch", "fill", "etch_scale")
-_KEYS = (*_ARRAYS, *_NUMBERS, "material", "levels", "etch_errors")
+_KEYS = (*_ARRAYS, *_NUMBERS, "material", "levels", "etch_errors", TABLE_KEY)
 
 
 def diffractive_from(
@@ -41,7 +47,7 @@ def diffractive_from(
     model: IndexModel,
     air: Environment | None,
     dtype: torch.dtype,
-) -> DiffractiveElement:
+) -> DiffractiveElement | Metasurface:
     """Build the diffractive element of a surface from a prescription.
 
     Raises:
@@ -50,8 +56,12 @@ def diffractive_from(
     where = f"{place}: {DIFFRACTIVE_KEY}"
     require_mapping(value, where)
     row: Mapping[str, Any] = value  # type: ignore[assignment]
-    check_keys(row, _KEYS, where)
     try:
+        if MIRROR in media:
+            raise InputError("a mirror cannot have one")
+        if TABLE_KEY in row:
+            return metasurface_from(row, surface, where, dtype)
+        check_keys(row, _KEYS, where)
         if surface.kind not in ("plane", "aperture") and (arrays := set(_ARRAYS) & set(row)):
             raise InputError(
                 f"a surface of type '{surface.kind}' cannot have '{arrays.pop()}'; allowed on "
@@ -72,8 +82,6 @@ def diffractive_from(
             raise InputError("'design_wavelength' is missing (nm), which makes heights of a phase")
         if surface.phase is not None and not bool(surface.phase.order):
             raise InputError("the phase's 'order' is 0, and no relief makes it")
-        if MIRROR in media:
-            raise InputError("a mirror cannot have one")
         material = None
         if "material" in row:
             material = parse_material(str(row["material"]), model, air)
@@ -92,7 +100,8 @@ def diffractive_from(
         relief.step(*media, relief.design_wavelength or VISIBLE)
         return element
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        message = str(error)
+        raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
 
 
 def _list(value: object) -> list[object]:
@@ -101,8 +110,10 @@ def _list(value: object) -> list[object]:
     return list(value)
 
 
-def diffractive_row(element: DiffractiveElement) -> dict[str, Any]:
+def diffractive_row(element: DiffractiveElement | Metasurface) -> dict[str, Any]:
     """Return what `diffractive_from` reads back as the same element, to the last bit."""
+    if isinstance(element, Metasurface):
+        return metasurface_row(element)
     data, plain = element.data, Relief()
     row: dict[str, Any] = {
         key: getattr(data, key)

@@ -18,6 +18,7 @@ from dolens.optics.elements import check_elements
 from dolens.optics.glass_catalog import glass_folders
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
+from dolens.prescriptions.cells import with_tables
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
 from dolens.prescriptions.numbers import require_mapping
 from dolens.prescriptions.other_programs import ReadPrescription
@@ -124,7 +125,8 @@ def load_prescription(path: str | Path) -> Any:
 def read_lens_file(path: str | Path) -> ReadPrescription:
     """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
-    return read_lens(read_file(path, MOST_BYTES), path)
+    found = read_lens(read_file(path, MOST_BYTES), path)
+    return found._replace(prescription=with_tables(found.prescription, path.parent))
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:

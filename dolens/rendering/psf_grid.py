@@ -164,11 +164,11 @@ def wave_point_spread_functions(
     waves = (waves[:, None] + torch.as_tensor(band).to(waves)).flatten()
     places = at.repeat_interleave(lines, 0), waves, centres.repeat_interleave(lines, 0)
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths), lines)
-    kernels, lost = _wave_kernels(system, places, PixelWindow(pitch, size), settings)
+    kernels, lost, kept = _wave_kernels(system, places, PixelWindow(pitch, size), settings)
+    total = (kernels.sum((-2, -1)) / kept).reshape(shape).mean(-1)
     kernels = kernels.reshape(*shape, size, size).mean(-3)
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _LIGHT_SAMPLES, 0, system)
     light = plane_points(imaging, points, disc).weight.sum(-1)
-    total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
     beyond = lost.reshape(shape).mean(-1).max()
     return FieldPointSpreadFunctions(kernels * share[..., None, None], light[:, 0], beyond)
@@ -179,17 +179,20 @@ def _wave_kernels(
     places: tuple[Tensor, Tensor, Tensor],
     window: PixelWindow,
     settings: DiffractionSettings | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return `wave_kernels` (N, K, K) of places, and the shares of light (N,), without gradient,
-    that a diffractive element puts beyond the window: as haze, they are even within it.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return `wave_kernels` (N, K, K) of places; the shares of light (N,), without gradient, that a
+    diffractive element puts beyond the window: as haze, they are even within it; and the share of
+    what arrives at the element that leaves it, (N,): cells of a metasurface keep some.
     """
     kernels = wave_kernels(system, *places, window, settings)
     if not system.diffractive:
-        return kernels, torch.zeros_like(kernels[:, 0, 0])
-    whole = element_flux(system, ObjectPoints.at(places[0]), *places[1:]).to(kernels)
+        flat = kernels[:, 0, 0]
+        return kernels, torch.zeros_like(flat), torch.ones_like(flat)
+    whole, kept = element_flux(system, ObjectPoints.at(places[0]), *places[1:])
+    whole, kept = (whole * kept).to(kernels), kept.to(kernels).clamp(min=_DARK)
     haze = (whole - kernels.sum((-2, -1))).clamp(min=0.0)
     kernels = kernels + (haze / window.size**2)[:, None, None]
-    return kernels, torch.where(whole > 0.0, haze / whole, 0.0).detach()
+    return kernels, torch.where(whole > 0.0, haze / whole, 0.0).detach(), kept
 
 
 def wave_cost(
@@ -391,11 +394,12 @@ def place_functions(
     a, b, c, d = (m[..., None, None].to(seen.rows) for m in ideal.inverse.flatten(-2).unbind(-1))
     moved = PlanePoints(a * down + b * across, c * down + d * across, seen.weight)
     found = splat_plane_points(moved, size, cpu_kernels_serve(system))
-    functions = found.functions
+    functions, light = found.functions, found.light
     if diffraction == "wave":
         places = object_points(imaging, points, (ideal.rows[..., None], ideal.columns[..., None]))
-        kernels, _ = _wave_kernels(system, places, PixelWindow(pitch, size))
+        kernels, _, kept = _wave_kernels(system, places, PixelWindow(pitch, size))
         functions = kernels.reshape_as(functions)
+        light = light * kept.reshape(functions.shape[:3]).mean(1)
     elif diffraction == "limit":
         f_number = working_f_number(imaging.pupil, system.vertices[-1])
         functions = with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
@@ -403,4 +407,4 @@ def place_functions(
     point = torch.zeros_like(functions[0, 0, 0])
     point[size // 2, size // 2] = 1.0
     functions = torch.where(total > _DARK, functions / total.clamp(min=_DARK), point)
-    return PlaceFunctions(functions, found.light, found.truncated)
+    return PlaceFunctions(functions, light, found.truncated)

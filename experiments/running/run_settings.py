@@ -10,6 +10,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice, check_count, did_you_mean
+from dolens.prescriptions.cells import with_tables
 from dolens.typed_values import check_type, parameters_of
 
 logger = logging.getLogger(__name__)
@@ -205,14 +206,15 @@ class RunSettings:
         return DTYPES[self.lens_dtype]
 
     def prescription(self) -> dict[str, Any]:
-        """Return the lens as plain data.
+        """Return the lens as plain data, with the tables of cells that it names as files.
 
         Raises:
-            InputError: there is none, as in a search for lenses, which makes its own.
+            InputError: there is none, as in a search for lenses, which makes its own; or a table
+                cannot be read.
         """
         if self.lens is None:
             raise InputError("lens: is missing from the configuration")
-        return OmegaConf.to_container(self.lens, resolve=True)
+        return with_tables(OmegaConf.to_container(self.lens, resolve=True))
 
 
 # The least that each may be; -1 of some means all, or no end.

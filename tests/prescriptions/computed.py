@@ -12,6 +12,7 @@ from dolens.errors import InputError
 from dolens.optics.diffractive import transmission
 from dolens.optics.fields import vignetting_margin
 from dolens.optics.lens import Lens
+from dolens.optics.metasurface import Cells
 from dolens.optics.rays import Rays
 
 # Where rays start: x and y, mm.
@@ -114,6 +115,9 @@ def _reliefs(lens: Lens) -> list[Tensor]:
     found = [torch.zeros(0)]
     for number in system.diffractive:
         relief = system.surfaces[number - 1].relief
+        if isinstance(relief, Cells):
+            found += [torch.view_as_real(relief.transmission(at, at, w)) for w in (500.0, 600.0)]
+            continue
         media = system.materials[number - 1], system.materials[number]
         for wave in (500.0, 600.0):
             passed = transmission(relief, at, at, relief.step(*media, wave) / wave, media)

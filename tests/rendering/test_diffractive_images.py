@@ -8,7 +8,8 @@ import torch
 from dolens.errors import InputError
 from dolens.experiments.camera.views.depths import DepthViews
 from dolens.optics.diffractive import lens_phase
-from dolens.prescriptions.build import lens_from_prescription
+from dolens.prescriptions.build import lens_from_prescription, prescription_of
+from dolens.prescriptions.cells import cell_table, cell_widths
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
@@ -72,6 +73,31 @@ def test_light_of_other_orders_is_haze_and_levels_have_gradients():
     assert 0.38 < coarse_bars / fine < 0.47
     (slope,) = torch.autograd.grad(binary.square().mean(), coarse.surfaces["2"].phase.p4)
     assert float(slope) != 0.0
+
+
+def test_light_that_cells_of_a_metasurface_keep_makes_the_picture_darker():
+    pitch, turns = 0.0025, torch.linspace(0.0, 1.0, 25)
+    rows = [["width_nm", "wavelength_nm", "phase_cycles", "power"]]
+    bright = [[100.0 + 100.0 * turn, 550.0, turn, 1.0] for turn in turns.tolist()]
+    pictures = []
+    renderer = PsfRenderer(SENSOR, (1, 1), size=33, diffraction="wave")
+    for share in (1.0, 0.49):
+        table = rows + [[*row[:3], share] for row in bright]
+        widths = cell_widths(cell_table(table), lens_phase(8.0, 550.0, 0.5), 550.0, pitch)
+        lens = flat_lens(torch.float32)
+        element = {"cells": table, "pitch": pitch, "widths": widths.tolist()}
+        data = prescription_of(lens)
+        data["surfaces"]["2"]["diffractive"] = element
+        lens = lens_from_prescription(data, torch.float32)
+        pictures.append(renderer.render(lens, SCENE, texture(), 0))
+    assert float(pictures[1].mean() / pictures[0].mean()) == pytest.approx(0.49, rel=1e-3)
+    kinoform = renderer.render(flat_lens(torch.float32), SCENE, texture(), 0)
+    # What three and a half cells to a zone send into other orders is haze.
+    assert float(pictures[0].mean() / kinoform.mean()) == pytest.approx(1.0, abs=0.02)
+    (slope,) = torch.autograd.grad(
+        pictures[1].square().mean(), lens.surfaces["2"].diffractive.widths
+    )
+    assert float(slope.abs().max()) > 0.0
 
 
 def test_a_colour_has_the_light_of_its_band():

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dolens.optics.coatings import Coating
     from dolens.optics.diffractive import DiffractiveElement
     from dolens.optics.gradients import GradientTerms
+    from dolens.optics.metasurface import Metasurface
     from dolens.optics.surfaces.deflection import Law
     from dolens.optics.surfaces.phase import Phase
 
@@ -168,7 +169,8 @@ class Surface(nn.Module):
             `dolens.optics.surfaces.deflection`.
         phase: a grating or a diffractive lens on this surface, or None.
         coating: what decides which share of the light passes, or None: all of it.
-        diffractive: the relief of a diffractive element, which waves see and rays do not, or None.
+        diffractive: relief or cells of a diffractive element, which waves see and rays do not, or
+            None.
         gradient: coefficients of a gradient of the index behind this surface, or None.
     """
 
@@ -185,7 +187,7 @@ class Surface(nn.Module):
     law: ClassVar["type[Law] | None"] = None
     phase: "Phase | None"
     coating: "Coating | None"
-    diffractive: "DiffractiveElement | None"
+    diffractive: "DiffractiveElement | Metasurface | None"
     gradient: "GradientTerms | None"
 
     def __init_subclass__(cls, **options: Any) -> None:

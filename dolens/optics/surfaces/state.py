@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dolens.optics.coatings import CoatingState
 from dolens.optics.diffractive import Relief
+from dolens.optics.metasurface import Cells
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.deflection import Deflected, Law, Media, Travel, Vector
@@ -36,7 +37,7 @@ class SurfaceState:
         edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
         deflection: what deflects light in the place of Snell's law, or None.
         coating: what decides which share of the light passes, or None: all of it.
-        relief: of a diffractive element, or None; rays do not see it.
+        relief: of a diffractive element, or its cells, or None; rays do not see it.
     """
 
     shape: type[Surface]
@@ -45,7 +46,7 @@ class SurfaceState:
     edge: Tensor | None = None
     deflection: LawState | None = None
     coating: CoatingState | None = None
-    relief: Relief | None = None
+    relief: Relief | Cells | None = None
 
     def deflect(self, point: Vector, direction: Vector, media: Media, travel: Travel) -> Deflected:
         """Deflect rays at points (mm) of the surface by its law; see `Law.deflect`."""
@@ -67,8 +68,8 @@ class SurfaceState:
             law = replace(law, parameters={n: p.double() for n, p in law.parameters.items()})
         parameters = {n: p.double() for n, p in self.parameters.items()}
         relief = self.relief
-        if relief is not None and relief.heights is not None:
-            relief = replace(relief, heights=relief.heights.double())
+        if relief is not None and relief.values is not None:
+            relief = relief.with_values(relief.values.double())
         return replace(self, parameters=parameters, deflection=law, relief=relief)
 
     def sag_and_slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -6,6 +6,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
+from omegaconf import OmegaConf
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.interruption import LoggedObjectives
@@ -107,3 +108,15 @@ def test_an_element_on_the_command_line(composed):
     assert (lens.elements["front"].first, lens.elements["front"].last) == (1, 3)
     tilt = lens.variables(["elements.front.tilt_x"])["elements.front.tilt_x"]
     assert float(tilt.detach()) == pytest.approx(math.radians(0.1), rel=1e-6)
+
+
+def test_a_configuration_may_name_a_table_of_cells_as_a_file(tmp_path, monkeypatch):
+    (tmp_path / "pillars.csv").write_text(
+        "width_nm wavelength_nm phase_rad power\n80 532 0.1 0.9\n120 532 0.7 0.8\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    lens = {"surfaces": {"1": {"diffractive": {"cells": "pillars.csv", "pitch": 0.0004}}}}
+    settings = SimpleNamespace(lens=OmegaConf.create(lens))
+    found = RunSettings.prescription(settings)["surfaces"]["1"]["diffractive"]
+    assert found["pitch"] == 0.0004
+    assert [row[:3] for row in found["cells"][1:]] == [[80.0, 532.0, 0.1], [120.0, 532.0, 0.7]]

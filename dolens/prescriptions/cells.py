@@ -1,0 +1,240 @@
+"""Cells of a metasurface in prescriptions and files, and widths for a wanted phase.
+
+A table of cells has a row for each width at each wavelength; its first row names the columns, in
+any order::
+
+    width_nm, wavelength_nm, phase_rad, power
+    80, 500, 0.31, 0.94
+    80, 532, 0.25, 0.95
+    ...
+
+`phase_cycles` may take the place of `phase_rad`, and `amplitude`, the root of the share of power
+that passes, that of `power`.  As a file it is such text (.csv, .txt; commas, semicolons, tabs or
+blanks between numbers; `#` begins a remark), or a list of rows in YAML, as in a prescription.  A
+lens file may name such a file, which is looked for beside it; a prescription names none, so that
+one from a stranger reads nothing.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError, check_keys
+from dolens.files import decode_text, read_file
+from dolens.optics.metasurface import Cells, CellTable, Metasurface
+from dolens.optics.surfaces.base import Surface, tensor_of
+from dolens.prescriptions.numbers import as_number, as_numbers, as_positive, number_in_text
+from dolens.prescriptions.plain_values import plain_values
+from dolens.prescriptions.row_data import phase_from
+
+TABLE_KEY = "cells"
+CELL_KEYS = (TABLE_KEY, "pitch", "widths")
+_COLUMNS = (
+    ("width_nm",),
+    ("wavelength_nm",),
+    ("phase_rad", "phase_cycles"),
+    ("power", "amplitude"),
+)
+_ALLOWED = "; ".join(" or ".join(names) for names in _COLUMNS)
+_YAML, _TEXT = (".yaml", ".yml"), (".csv", ".txt")
+_MOST_BYTES, _MOST_ROWS = 64 * 2**20, 200_000
+# A solver's share of power may exceed one by so much.
+_ABOVE_ONE = 1e-3
+# Widths that are tried, and phases within a turn that they are found for.
+_TRIED, _PHASES = 2048, 2048
+
+
+def read_cells(path: str | Path) -> CellTable:
+    """Read a table of cells from a file.
+
+    Raises:
+        InputError: the file cannot be read, or holds no table; one line that names it.
+    """
+    place, suffix = str(path), Path(path).suffix.lower()
+    if suffix not in (*_YAML, *_TEXT):
+        allowed = ", ".join((*_TEXT, *_YAML))
+        raise InputError(f"{place}: a table of cells ends in one of {allowed}")
+    text = decode_text(read_file(path, _MOST_BYTES, "table of cells"), place)
+    return cell_table(plain_values(text, place) if suffix in _YAML else _rows_of(text), place)
+
+
+def _rows_of(text: str) -> list[list[str]]:
+    """Return the words of the lines of a text, without remarks."""
+    lines = [line.partition("#")[0].strip() for line in text.removeprefix("\ufeff").splitlines()]
+    lines = [line for line in lines if line]
+    mark = next((mark for mark in ";,\t" if lines and mark in lines[0]), None)
+    return [[word.strip() for word in line.split(mark)] for line in lines]
+
+
+def cell_table(rows: object, place: str = "cells") -> CellTable:
+    """Return the table of rows, of which the first names the columns; see the module.
+
+    Args:
+        rows: of names, and of numbers.
+        place: begins messages.
+
+    Raises:
+        InputError: one line that says which row is wrong, and what is allowed.
+    """
+    if not isinstance(rows, list | tuple) or not all(isinstance(r, list | tuple) for r in rows):
+        raise InputError(f"{place}: must be rows, of which the first names the columns: {_ALLOWED}")
+    if not 1 < len(rows) <= _MOST_ROWS:
+        raise InputError(f"{place}: has {len(rows)} rows; allowed: 2 to {_MOST_ROWS}")
+    names = [str(name) for name in rows[0]]
+    chosen = [[name for name in names if name in either] for either in _COLUMNS]
+    if len(names) != len(_COLUMNS) or any(len(found) != 1 for found in chosen):
+        raise InputError(f"{place}: has the columns {', '.join(names)}; allowed: {_ALLOWED}")
+    order = [names.index(found[0]) for found in chosen]
+    table: dict[tuple[float, float], tuple[float, float]] = {}
+    for number, row in enumerate(rows[1:], 1):
+        where = f"{place}: row {number}"
+        if len(row) != len(names):
+            raise InputError(f"{where}: has {len(row)} numbers, not {len(names)}")
+        width, wave, phase, passed = (_number(row[k], f"{where}: {names[k]}") for k in order)
+        if not width > 0.0 or not wave > 0.0:
+            raise InputError(f"{where}: {width:g} nm at {wave:g} nm; allowed: above 0")
+        if not 0.0 <= passed <= 1.0 + _ABOVE_ONE:
+            raise InputError(f"{where}: {chosen[3][0]} is {passed:g}; allowed: 0 to 1")
+        if (wave, width) in table:
+            raise InputError(f"{where}: the width {width:g} nm at {wave:g} nm is given twice")
+        turn = 2.0 * math.pi if chosen[2] == ["phase_cycles"] else 1.0
+        table[wave, width] = turn * phase, passed if chosen[3] == ["amplitude"] else passed**0.5
+    waves, widths = (sorted({key[k] for key in table}) for k in (0, 1))
+    for wave in waves:
+        for width in widths:
+            if (wave, width) not in table:
+                raise InputError(f"{place}: the width {width:g} nm at {wave:g} nm is missing")
+    numbers = np.array([[table[wave, width] for width in widths] for wave in waves])
+    try:
+        return CellTable(np.array(widths), np.array(waves), numbers[..., 0], numbers[..., 1])
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+
+
+def _number(value: object, place: str) -> float:
+    return number_in_text(value, place) if isinstance(value, str) else as_number(value, place)
+
+
+def metasurface_from(
+    row: Mapping[str, Any], surface: Surface, where: str, dtype: torch.dtype
+) -> Metasurface:
+    """Build the cells of a surface from the `diffractive` key of a prescription.
+
+    Raises:
+        InputError: one line that says what is wrong, and what is allowed.
+    """
+    check_keys(row, CELL_KEYS, where)
+    if surface.kind not in ("plane", "aperture"):
+        raise InputError(f"a surface of type '{surface.kind}' cannot have 'cells'; allowed: plane")
+    for key in CELL_KEYS:
+        if row.get(key) is None:
+            raise InputError(f"'{key}' is missing; cells need {', '.join(CELL_KEYS)}")
+    if isinstance(row[TABLE_KEY], str):
+        raise InputError(
+            f"'{TABLE_KEY}': '{row[TABLE_KEY]}' is a file's name, which lens files and experiments "
+            "may give; prescriptions as data have its rows (cell_rows(read_cells(file)))"
+        )
+    table = cell_table(row[TABLE_KEY], f"'{TABLE_KEY}'")
+    widths = tensor_of(as_numbers(row["widths"], "'widths'"), "widths", dtype)
+    cells = Cells(table, widths, as_number(row["pitch"], "'pitch'"))
+    found = Metasurface(cells, dtype)
+    cells.check([], where)
+    return found
+
+
+def metasurface_row(element: Metasurface) -> dict[str, Any]:
+    """Return what `metasurface_from` reads back as the same cells, to the last bit."""
+    return {
+        TABLE_KEY: cell_rows(element.table),
+        "pitch": element.pitch,
+        "widths": element.widths.detach().tolist(),
+    }
+
+
+def with_tables(prescription: Any, folder: str | Path = "") -> Any:
+    """Return a prescription that has the rows of the tables of cells that it names as files.
+
+    Args:
+        prescription: plain values, of a lens or not.
+        folder: that the files' names start from; the one that the program runs in unless given.
+
+    Raises:
+        InputError: a file cannot be read, or holds no table; one line that names it.
+    """
+    rows = prescription.get("surfaces") if isinstance(prescription, Mapping) else None
+    if not isinstance(rows, Mapping):
+        return prescription
+    found = {}
+    for number, row in rows.items():
+        element = row.get("diffractive") if isinstance(row, Mapping) else None
+        if isinstance(element, Mapping) and isinstance(file := element.get(TABLE_KEY), str):
+            table = cell_rows(read_cells(Path(folder) / file))
+            found[number] = {**row, "diffractive": {**element, TABLE_KEY: table}}
+    return {**prescription, "surfaces": {**rows, **found}} if found else prescription
+
+
+def cell_rows(table: CellTable) -> list[list[Any]]:
+    """Return the rows that `cell_table` reads back as the same table, to the last bit."""
+    rows: list[list[Any]] = [["width_nm", "wavelength_nm", "phase_rad", "amplitude"]]
+    for wave, phases, amplitudes in zip(
+        table.wavelengths.tolist(), table.phase.tolist(), table.amplitude.tolist(), strict=True
+    ):
+        each = zip(table.widths.tolist(), phases, amplitudes, strict=True)
+        rows += [[width, wave, phase, passed] for width, phase, passed in each]
+    return rows
+
+
+def cell_widths(
+    table: CellTable,
+    phase: Mapping[str, Any],
+    wavelength: float,
+    pitch: float,
+    semi_diameter: float | None = None,
+    rings: bool = False,
+) -> Tensor:
+    """Return the widths whose light is nearest to a wanted phase, in complex amplitude.
+
+    Of each cell it is the width of the least |t - exp(iφ)|, φ being the phase at its centre.
+
+    Args:
+        table: of the cells.
+        phase: as a surface of a prescription has it, for example `lens_phase(0.1, 532, 0.02)`.
+        wavelength: nm, that the phase is wanted at.
+        pitch: mm, of cells or rings.
+        semi_diameter: mm, to the side of the square of cells, or to the last ring; None: the
+            phase's `norm_radius`.
+        rings: whether to return rings, of a phase that is the same at every azimuth.
+
+    Returns:
+        nm, (N, N) as `widths` of a prescription has them, or (K,) of rings.
+
+    Raises:
+        InputError: a wavelength outside of the table, or no phase or extent.
+    """
+    law = phase_from(phase, "phase", torch.float64)
+    reach = phase.get("norm_radius") if semi_diameter is None else semi_diameter
+    reach, pitch = as_positive(reach, "'semi_diameter'"), as_positive(pitch, "'pitch'")
+    low, high = float(table.widths[0]), float(table.widths[-1])
+    tried = torch.linspace(low, high, _TRIED, dtype=torch.float64)
+    Cells(table, tried, pitch).check([wavelength], "widths of cells")
+    parameters = {**dict(law.named_parameters()), **dict(law.named_buffers())}
+    half = math.ceil(reach / pitch - 1e-9)
+    at = (torch.arange(half, dtype=torch.float64) + 0.5) * pitch
+    across, down = at, torch.zeros(1, dtype=torch.float64)
+    if not rings:
+        across = down = torch.cat((-at.flip(0), at))
+    columns, rows = across[None].expand(len(down), -1), down[:, None].expand(-1, len(across))
+    with torch.no_grad():
+        wanted = law.phase_and_gradient(parameters, columns, rows)[0]
+        passed = table.transmission(tried, wavelength)
+        turns = torch.arange(_PHASES, dtype=torch.float64) * (2.0 * math.pi / _PHASES)
+        # |t - e^{iφ}|² = |t|² + 1 - 2·Re(t·e^{-iφ}).
+        along = passed.real[:, None] * turns.cos() + passed.imag[:, None] * turns.sin()
+        best = tried[(passed.abs().square()[:, None] - 2.0 * along).argmin(0)]
+        found = best[(wanted * (_PHASES / (2.0 * math.pi))).round().long() % _PHASES]
+    return found[0] if rings else found
