@@ -216,12 +216,13 @@ def offenders_figure(
 
 
 def parameter_label(name: str) -> str:
-    """Return the label of a parameter in figures: `front tilt x`, `curvature 3`, `thickness 1`,
-    `source 0 z`, and `sources z` of all sources (`sources.*.z`).
+    """Return the label of a parameter in figures: `front tilt x`, `curvature 3`, `gradient 1 r2`,
+    `thickness 1`, `source 0 z`, and `sources z` of all sources (`sources.*.z`).
     """
     first, *rest = name.split(".")
     if first == "surfaces":
-        return f"{rest[1]} {rest[0]}"
+        number, name, *term = rest
+        return " ".join((name, number, *term))
     label = name.removeprefix("elements.").replace(".*.", " ")
     for many, one in _SINGULAR.items():
         label = label.replace(many, one)

@@ -14,13 +14,15 @@ Source: OpticStudio's help, "Gradient 1" to "Gradient 12".
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.gradients import MOST_POWERS
+from dolens.optics.gradients import MOST_POWERS, Gradient
+from dolens.optics.materials import Material, index_model, parse_material
 from dolens.prescriptions.zemax.file import SurfaceBlock
 from dolens.prescriptions.zemax.gradient_files import FILES, gradient_glass
-from dolens.prescriptions.zemax.table import ZemaxShape
+from dolens.prescriptions.zemax.table import ZemaxShape, named
 
 # TYPE → terms of PARM 3, PARM 4, ...
 GRADIENTS: dict[str, tuple[str, ...]] = {
@@ -94,19 +96,64 @@ def gradient_medium(block: SurfaceBlock) -> str | None:
         )
     squared = block.type == _SQUARED
     values = {
-        term: block.slot(f"PARM {slot}", -int(term[1:] or 1))
-        for slot, term in enumerate(terms, 4 if ordered else 3)
+        term: block.slot(slot, -_power(term))
+        for slot, term in _slots(block.type).items()
+        if named(block.slots.get(slot, "0"))
     }
     order = block.slot("PARM 2") if ordered else 0.0
-    beyond = [t for t, v in values.items() if v and int(t[1:] or 1) > order] if ordered else []
+    beyond = [t for t, v in values.items() if v and _power(t) > order] if ordered else []
     if beyond:
         raise InputError(
             f"{block.place}: PARM 2 says that the polynomials are of order {order:g}, but there is "
             f"a coefficient of {beyond[0]}"
         )
     base = repr(math.sqrt(n) if squared else n)
-    words = [f"{term}={value!r}" for term, value in values.items() if value]
+    words = [f"{term}={value!r}" for term, value in values.items()]
     return " ".join([f"gradient{'_squared' * squared}", base, *words]) if words else base
+
+
+def _slots(kind: str) -> dict[str, str]:
+    """Return slot → term of the coefficients of a TYPE."""
+    first = 4 if kind == _ORDERED else 3
+    return {f"PARM {slot}": term for slot, term in enumerate(GRADIENTS[kind], first)}
+
+
+def _power(term: str) -> int:
+    return int(term[1:] or 1)
+
+
+def gradient_lines(row: Mapping[str, Any], place: str) -> tuple[str, list[str]] | None:
+    """Return the TYPE and the lines PARM of the surface in front of a gradient; None where a row of
+    a prescription has none.
+
+    Raises:
+        InputError: Zemax has no such gradient, or none behind a surface of this type.
+    """
+    material = str(row.get("material"))
+    if not material.lower().startswith("gradient"):
+        return None
+    medium = parse_material(material, index_model("dfc"))
+    assert isinstance(medium, Gradient)  # as its first word says
+    refused = f"{place}: a .zmx file cannot hold material '{material}'"
+    if medium.dispersions or not isinstance(medium.base, Material) or medium.base.b:
+        raise InputError(f"{refused}: the index is written for one wavelength there")
+    if row.get("type", "sphere") not in _IN_FRONT or row.get("phase"):
+        raise InputError(f"{refused} behind a surface that is no {', '.join(_IN_FRONT)}")
+    values = dict(medium.terms)
+    kinds = (kind for kind in _WRITTEN if (kind == _SQUARED) == medium.squared)
+    kind = next((kind for kind in kinds if values.keys() <= {*GRADIENTS[kind]}), None)
+    if kind is None:
+        raise InputError(f"{refused}: no gradient of Zemax's has these terms together")
+    n = medium.base.a
+    numbers = {"PARM 2": repr(n * n if medium.squared else n)}
+    if kind == _ORDERED:
+        numbers = {"PARM 2": f"{max(map(_power, values))}", "PARM 3": repr(n)}
+    numbers |= {s: repr(values[term]) for s, term in _slots(kind).items() if term in values}
+    return kind, [f"{slot} {number}" for slot, number in numbers.items()]
+
+
+_IN_FRONT = ("plane", "sphere", "conic")
+_WRITTEN = ("GRINSUR1", "GRINSUR3", "GRINSUR4", "GRINSUR5", "GRINSUR2", "GRINSU12")
 
 
 def _of_a_file(block: SurfaceBlock, glass: list[str]) -> str:

@@ -401,7 +401,6 @@ SHAPES = {
                 type=kind,
                 kinds=(),
                 kind="conic",
-                base=CONIC,
                 others=_parm(*range(1, last + 1)),
                 refused=REFUSED.get(kind, {}),
                 own_read=tilted_row,

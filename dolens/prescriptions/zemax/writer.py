@@ -24,6 +24,7 @@ from dolens.prescriptions.zemax.configurations import (
 )
 from dolens.prescriptions.zemax.file import parse_zemax
 from dolens.prescriptions.zemax.glass import catalogue_line, glass_line
+from dolens.prescriptions.zemax.gradients import gradient_lines
 from dolens.prescriptions.zemax.reader import prescription_from_zemax
 from dolens.prescriptions.zemax.shapes import shape_of_row
 from dolens.prescriptions.zemax.system import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
@@ -250,11 +251,13 @@ def _air(prescription: Mapping[str, Any], where: str) -> str:
 
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:
     """Write a surface's block, without its number, stop and distance."""
-    shape = shape_of_row(row, place)
-    lines = [f"  TYPE {shape.type}"]
+    shape, gradient = shape_of_row(row, place), gradient_lines(row, place)
+    kind, medium = gradient or (shape.type, [])
+    lines = [f"  TYPE {kind}"]
     if row.get("note"):
         lines.append(f"  COMM {row['note']}")
     lines += [f"  {line}" for line in shape.write(row, place)]
     if not shape.surface:
         return lines
-    return [*lines, *glass_line(row.get("material"), place), *aperture_lines(row, place)]
+    medium = glass_line(row.get("material"), place) if gradient is None else medium
+    return [*lines, *(f"  {line.strip()}" for line in medium), *aperture_lines(row, place)]

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from dolens import InputError, Rays, load_lens
+from dolens import InputError, Rays, load_lens, save_lens
 from dolens.optics.glass_catalog import glass_folders
-from dolens.prescriptions.build import lens_from_prescription
+from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.files import check_file
 from dolens.prescriptions.zemax.reader import read_zemax
 from tests.prescriptions.zemax.samples import GLASS, singlet
@@ -177,3 +177,52 @@ def test_the_polished_end_of_a_rod_is_a_tilted_plane(tmp_path):
     # n·d - d₀ is along the normal.
     jump = n * hit.direction.detach() - straight
     assert float(jump.dot(normal)) == pytest.approx(float(jump.norm()), rel=1e-14)
+
+
+PLANE = {"type": "plane", "semi_diameter": 1.0}
+CONIC = {"type": "conic", "radius": 20.0, "conic": -0.5, "semi_diameter": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("front", "material", "kind"),
+    [
+        (PLANE, "gradient 1.6 r2=-0.002", "GRINSUR1"),
+        (CONIC, "gradient_squared 1.5 r2=-0.02 r6=0.0 r12=2e-09", "GRINSUR2"),
+        (CONIC, "gradient 1.6 r2=-0.002 z=0.1 z3=1e-05", "GRINSUR3"),
+        (PLANE, "gradient 1.6 z2=0.01 x=0.1 y2=0.02", "GRINSUR4"),
+        (PLANE, "gradient 1.6 r4=-0.001 z4=1e-06", "GRINSUR5"),
+        (PLANE, "gradient 1.6 z7=1e-06 x=0.1 y2=0.0", "GRINSU12"),
+    ],
+)
+def test_a_gradient_is_written_and_read_again(tmp_path, front, material, kind):
+    rows = {
+        "1": {**front, "thickness": 4.0, "material": material},
+        "2": {**PLANE, "material": "air"},
+    }
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 3.0}})
+    save_lens(lens, tmp_path / "a.zmx")
+    assert f"TYPE {kind}\n" in (tmp_path / "a.zmx").read_text()
+    again = load_lens(tmp_path / "a.zmx")
+    assert again.materials == lens.materials
+    assert prescription_of(again)["surfaces"] == prescription_of(lens)["surfaces"]
+
+
+@pytest.mark.parametrize(
+    ("front", "material", "message"),
+    [
+        (PLANE, "gradient N-BK7 r2=-0.002", "the index is written for one wavelength there"),
+        (PLANE, "gradient 1.6 r2=-0.002+1e-4/w2", "the index is written for one wavelength there"),
+        (PLANE, "gradient 1.6 r2=-0.002 x=1e-3", "no gradient of Zemax's has these terms together"),
+        (PLANE, "gradient_squared 1.6 z=0.1", "no gradient of Zemax's has these terms together"),
+        ({**CONIC, "type": "even_asphere", "a4": 1e-5}, "gradient 1.6 r2=-0.1", "that is no plane"),
+    ],
+)
+def test_a_gradient_that_zemax_has_not_is_refused(tmp_path, front, material, message):
+    rows = {
+        "1": {**front, "thickness": 4.0, "material": material},
+        "2": {**PLANE, "material": "air"},
+    }
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 3.0}})
+    with pytest.raises(InputError, match=message) as caught:
+        save_lens(lens, tmp_path / "a.zmx")
+    assert "surface 1" in str(caught.value) and "\n" not in str(caught.value)
