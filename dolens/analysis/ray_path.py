@@ -1,6 +1,7 @@
 """One ray is followed from surface to surface, with the reason why it ends where it does."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,15 +14,13 @@ from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.surfaces.refraction import PlaneRay, tolerance_scale
 from dolens.optics.surfaces.state import SurfaceState
-from dolens.optics.system import OpticalSystem, require_homogeneous
 from dolens.optics.text_tables import html_table, printable, text_table
+from dolens.optics.trace import Crossing as SurfaceCrossing
 from dolens.optics.trace import (
-    Meeting,
     Trace,
     distance_to_plane,
     enter_lens,
     first_failure,
-    meet,
     trace_surfaces,
     trace_to_sensor,
     transfer,
@@ -97,9 +96,8 @@ def ray_path(lens: Lens, rays: Rays) -> RayPath:
         rays: one ray, from the object towards the sensor.
 
     Raises:
-        InputError: more or fewer than one ray, or a medium is a gradient, in which rays bend.
+        InputError: more or fewer than one ray.
     """
-    require_homogeneous(lens.system(), "the path of one ray")
     components = rays.components()
     if components.x.numel() != 1:
         raise InputError(f"a path is that of one ray, not of {components.x.numel()}")
@@ -119,14 +117,26 @@ def ray_path(lens: Lens, rays: Rays) -> RayPath:
         here, _ = change_axes(ray, LENS_AXES, system.axes[number - 1])
         sense, is_last = system.senses[number - 1], number == last
         if is_last and status == Status.MISSED:
-            ending = f"surface {number}: {_why_missed(surface, here, sense)}"
+            reason = _why_missed(surface, here, sense)
+            if number - 1 in system.gradients:
+                reason = "missed: the ray bends away from it, or leaves the gradient's medium"
+            ending = f"surface {number}: {reason}"
             break
-        meeting = meet(surface, here, sense, system.from_the_side)
-        step = trace_surfaces(system, ray, wavelength, record=True, first=number, last=number)
+        met: list[SurfaceCrossing] = []
+        step = trace_surfaces(
+            *(system, ray, wavelength),
+            record=True,
+            first=number,
+            last=number,
+            crossings=met,
+        )
         ray = step.ray
-        crossings.append(_crossing(number, surface, here, meeting, step))
+        crossings.append(_crossing(number, surface, met[0], step))
         if is_last and status == Status.TIR:
-            reason = _why_reflected(system, wavelength, number, surface, crossings[-1])
+            indices = (
+                met[0].indices if system.gradients else system.indices(wavelength)[number - 1 :]
+            )
+            reason = _why_reflected(indices, surface, crossings[-1])
             ending = f"surface {number}: {reason}"
             break
         if is_last:
@@ -147,11 +157,9 @@ def _holds(margin: Tensor | None) -> bool:
     return margin is None or bool(margin > 0.0)
 
 
-def _crossing(
-    number: int, surface: SurfaceState, here: Components, meeting: Meeting, traced: Trace
-) -> Crossing:
-    normal = surface.shape.normal(surface.parameters, *meeting.ray[:3])
-    cosine = abs(sum(float(a) * float(b) for a, b in zip(normal, here[3:], strict=True)))
+def _crossing(number: int, surface: SurfaceState, met: SurfaceCrossing, traced: Trace) -> Crossing:
+    normal = surface.shape.normal(surface.parameters, *met.point)
+    cosine = abs(sum(float(a) * float(b) for a, b in zip(normal, met.arriving, strict=True)))
     x, y, z = (float(c) for c in traced.points[-1])
     l, m, n = (float(c) for c in traced.ray[3:])  # noqa: E741
     return Crossing(
@@ -159,7 +167,7 @@ def _crossing(
         (x, y, z),
         (l, m, n),
         math.degrees(math.acos(min(cosine, 1.0))),
-        math.hypot(float(meeting.ray.x), float(meeting.ray.y)),
+        math.hypot(float(met.point[0]), float(met.point[1])),
         surface.semi_diameter,
     )
 
@@ -188,20 +196,15 @@ def _why_missed(surface: SurfaceState, here: Components, sense: float) -> str:
 
 
 def _why_reflected(
-    system: OpticalSystem,
-    wavelength: float | Tensor,
-    number: int,
-    surface: SurfaceState,
-    crossing: Crossing,
+    indices: Sequence[float | Tensor], surface: SurfaceState, crossing: Crossing
 ) -> str:
-    """Say why no light of a ray goes on behind a surface."""
+    """Say why no light of a ray goes on behind a surface; indices are those in front and behind."""
     if surface.deflection is not None:
         return (
             f"no light goes on: the {surface.deflection.law.kind}'s order is evanescent at "
             f"{crossing.incidence:.3f}° of incidence"
         )
-    indices = system.indices(wavelength)
-    before, after = (abs(float(indices[place])) for place in (number - 1, number))
+    before, after = (abs(float(index)) for index in indices[:2])
     critical = math.degrees(math.asin(min(1.0, after / before)))
     return (
         f"total internal reflection: {crossing.incidence:.3f}° of incidence, beyond the critical "

@@ -234,6 +234,26 @@ def test_single_precision_is_near_to_double():
     close(single.position.double(), hit.position.detach(), 3e-6)
 
 
+def test_the_path_of_one_ray_lists_where_it_bends_to():
+    # Meridional and parallel in a rod: y = y0·cos ωt, and n·sin θ = dy/dt at its end face.
+    y0, length = 0.8, 0.15 * PITCH
+    lens = lens_of(ROD, length)
+    path = ray_path(lens, beam((0.0, y0)))
+    first, second, sensor = path.crossings
+    along = N0 * math.sqrt(1.0 - A * y0**2)
+    phase = N0 * math.sqrt(A) * length / along
+    assert first.point == pytest.approx((0.0, y0, 0.0), abs=1e-12) and first.incidence == 0.0
+    assert second.point == pytest.approx((0.0, y0 * math.cos(phase), length), abs=1e-12)
+    slope = y0 * N0 * math.sqrt(A) * math.sin(phase)
+    n = math.hypot(slope, along)
+    assert second.incidence == pytest.approx(math.degrees(math.asin(slope / n)), abs=1e-9)
+    assert second.direction[1] == pytest.approx(-slope, abs=1e-12)
+    assert sensor.surface == "sensor" and path.ending == "the ray reaches the sensor"
+    # Steep rays go back into the rod.
+    steep = ray_path(lens_of(f"gradient_squared {N0} r2=-0.6", 1.6), beam((0.0, 1.8)))
+    assert "surface 2: total internal reflection" in steep.ending
+
+
 def test_light_that_goes_back_takes_the_same_way():
     lens, rays = thick_lens(), beam(*RAYS["points"], slopes=RAYS["slopes"])
     hit = lens.trace(rays)
@@ -639,7 +659,6 @@ def test_what_does_not_hold_in_a_gradient_is_refused_by_name(tmp_path):
         "Seidel sums": lambda: lens.seidel(5.0),
         "ghosts": lambda: lens.ghosts(),
         "polarised rays": lambda: lens.trace_polarised(beam((0.0, 0.1))),
-        "the path of one ray": lambda: ray_path(lens, beam((0.0, 0.1))),
         "another temperature": lambda: lens.at(40.0),
     }
     for what, view in views.items():

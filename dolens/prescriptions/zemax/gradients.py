@@ -42,6 +42,7 @@ _SQUARED, _ORDERED = "GRINSUR2", "GRINSU12"
 _KINKED = "an odd power of |y| is not held in a gradient"
 # TYPE → the slots of PARM that no medium holds, and what they are about.
 REFUSED = {
+    "GRINSUR1": {"PARM 4": "a term in r, with a kink on the axis, is not held in a gradient"},
     "GRINSU10": dict.fromkeys(("PARM 3", "PARM 5", "PARM 7"), _KINKED),
 }
 # TYPE → the slots of the tangents of a tilt along x and y, which are added to the sag.

@@ -84,7 +84,7 @@ def test_a_rod_of_a_quarter_of_its_pitch_brings_parallel_light_to_its_end(tmp_pa
     ("given", "message"),
     [
         (("GRINSUR3",), "PARM 2, the index at the vertex, must be positive, not 0"),
-        (("GRINSUR1", "1", "1.6", "0", "3"), "PARM 4 is 3, but TYPE GRINSUR1 has PARM 1 to 3"),
+        (("GRINSUR1", "1", "1.6", "0", "3"), "a term in r, with a kink on the axis"),
         (("GRINSUR5", "1", "1.6", *("0",) * 6, "0.1"), "a curved surface with a tilt is not held"),
         (("GRINSUR7", "1", "1.6"), "a gradient-index medium of this kind is not held"),
         (("GRINSUR9", "1"), "TYPE GRINSUR9 needs GLAS, a gradient-index glass"),
