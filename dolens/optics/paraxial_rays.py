@@ -31,7 +31,7 @@ from dolens.optics.rays import Components
 from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.ideal_lens import IdealLens
 from dolens.optics.surfaces.refraction import PlaneRay
-from dolens.optics.system import OpticalSystem, per_radian, require_homogeneous
+from dolens.optics.system import OpticalSystem, per_radian
 
 
 class ParaxialRay(NamedTuple):
@@ -96,11 +96,7 @@ def paraxial_rays(
         field: radians, the chief ray's slope being tan(field), for an object at infinity; else the
             height of the object point in mm, from which the chief ray comes down.
         object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
-
-    Raises:
-        InputError: a medium is a gradient, in which slopes change between surfaces.
     """
-    require_homogeneous(system, "paraxial rays, surface by surface")
     matrix = matrix_to_stop(system, wavelength)
     a, b = matrix[0, 0], matrix[0, 1]
     n = system.signed_indices(wavelength)
@@ -114,21 +110,29 @@ def paraxial_rays(
     chief_y, chief_u = ratio(-b * n[0] * tangent, at_stop), ratio(a * tangent, at_stop)
 
     start = TwoRays(y, chief_y, n[0] * (y * near), n[0] * chief_u)
-    powers = powers_of(system, wavelength)
-    behind = list(through_surfaces(start, curvatures_of(system), system.thicknesses, n, powers))
-    reduced = [start, *behind]
-    marginal = _ray([s.y for s in behind], [s.nu for s in reduced], n)
-    chief = _ray([s.y2 for s in behind], [s.nu2 for s in reduced], n)
+    powers, gaps = powers_of(system, wavelength), system.paraxial_gaps(wavelength)
+    behind = list(through_surfaces(start, curvatures_of(system), gaps, n, powers))
+    arriving, fronts = [start], [n[0]]
+    for rays, gap, index in zip(behind, gaps, n[1:], strict=False):
+        arriving.append(rays.transferred(gap, index))
+        fronts.append(gap.behind if isinstance(gap, BentGap) else index)
+    marginal = ParaxialRay(
+        torch.stack([s.y for s in behind]),
+        _slopes([s.nu for s in arriving], fronts),
+        _slopes([s.nu for s in behind], n[1:]),
+    )
+    chief = ParaxialRay(
+        torch.stack([s.y2 for s in behind]),
+        _slopes([s.nu2 for s in arriving], fronts),
+        _slopes([s.nu2 for s in behind], n[1:]),
+    )
     invariant = start.nu * chief_y - start.nu2 * y
     return ParaxialRays(marginal, chief, invariant)
 
 
-def _ray(
-    heights: list[Tensor], reduced: list[Tensor], indices: Sequence[float | Tensor]
-) -> ParaxialRay:
-    """A ray from its heights and from its reduced slopes before and behind all surfaces."""
-    slopes = torch.stack([nu / n for nu, n in zip(reduced, indices, strict=True)])
-    return ParaxialRay(torch.stack(heights), slopes[:-1], slopes[1:])
+def _slopes(reduced: list[Tensor], indices: Sequence[float | Tensor]) -> Tensor:
+    """Return slopes at all surfaces of reduced ones in media of these indices."""
+    return torch.stack([nu / n for nu, n in zip(reduced, indices, strict=True)])
 
 
 Number = Any  # of Python's, or a tensor

@@ -462,6 +462,29 @@ def test_first_order_optics_of_a_parabolic_rod():
     assert numbers.exit_pupil(550.0)[0] == pytest.approx(float(first.exit_pupil.z), rel=1e-13)
 
 
+def test_paraxial_rays_bend_between_the_faces_of_a_rod():
+    length, g = 0.15 * PITCH, math.sqrt(A)
+    lens = lens_of(ROD, length, {"semi_diameter": 1.0}, stop=1)
+    marginal = lens.paraxial_rays(0.0, 550.0).marginal
+    assert marginal.height.tolist() == pytest.approx([1.0, math.cos(g * length)], rel=1e-13)
+    arriving = -g * math.sin(g * length)
+    assert marginal.slope_before.tolist() == pytest.approx([0.0, arriving], rel=1e-13)
+    assert marginal.slope_after.tolist() == pytest.approx([0.0, N0 * arriving], rel=1e-13)
+
+
+def test_automatic_apertures_take_the_light_that_a_rod_spreads():
+    # Light of 5° fills the rod's end: |y| + |ȳ| of the marginal and the chief ray, nearly.
+    length, g = 0.2 * PITCH, math.sqrt(A)
+    fields = {"angles": [[0.0, 0.0], [0.0, 5.0]]}
+    lens = lens_of(
+        ROD, length, {"semi_diameter": 0.3}, {"semi_diameter": "auto"}, stop=1, fields=fields
+    )
+    known = 0.3 * math.cos(g * length) + math.tan(math.radians(5.0)) * math.sin(g * length) / (
+        g * N0
+    )
+    assert lens.surfaces["2"].semi_diameter == pytest.approx(known, rel=0.02)
+
+
 def test_the_eye_of_liou_and_brennan_has_its_published_power_and_length():
     # J. Opt. Soc. Am. A 14, 1684 (1997): 60.35 D, and in focus at 23.95 mm, at 555 nm.
     rows = {
