@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.crystals import Uniaxial
+from dolens.optics.gradients import Gradient
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
 from dolens.sensor.pixels import Sensor
@@ -97,9 +98,13 @@ class Unmodelled:
 
 
 def shifted_medium(medium: Medium, shift: float) -> Any:
-    """Return a medium whose index is larger by a number, of a crystal both indices."""
+    """Return a medium whose index is larger by a number, of a crystal both indices, of a gradient
+    everywhere.
+    """
     if isinstance(medium, Uniaxial):
         return medium.of(lambda own: ShiftedMedium(own, shift))
+    if isinstance(medium, Gradient):
+        return replace(medium, base=ShiftedMedium(medium.base, shift))
     return ShiftedMedium(medium, shift)
 
 

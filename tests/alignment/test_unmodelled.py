@@ -301,3 +301,17 @@ def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(single
     torch.testing.assert_close(exact.chi_squared, moved.chi_squared, rtol=1e-6, atol=0.0)
     step = (moved.values - exact.values)[0] * one.units
     torch.testing.assert_close(step, 1e-4 * alone.nuisance_sensitivity[:, 0], rtol=1e-6, atol=1e-12)
+
+
+def test_a_gradient_of_another_index_still_bends_light():
+    # n + r2·r²: a rod of the focal length 1/(n·g·sin gL), g² = -2·r2/n.
+    plane = {"type": "plane", "semi_diameter": 0.5}
+    rod = {**plane, "thickness": 3.0, "material": "gradient 1.6 r2=-0.08"}
+    rows = {"1": rod, "2": {**plane, "material": "air"}}
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 1.0}})
+    made = Unmodelled(index=0.05).made(lens, torch.Generator().manual_seed(1))
+    n = float(made.materials[1].index(550.0))
+    g = math.sqrt(0.16 / n)
+    assert abs(n - 1.6) > 1e-3
+    known = 1.0 / (n * g * math.sin(3.0 * g))
+    assert float(made.first_order(550.0).efl.detach()) == pytest.approx(known, rel=1e-12)
