@@ -148,6 +148,34 @@ def turned_slopes(light: "ElementLight", n: int, x: Tensor, y: Tensor) -> tuple[
     return slopes, inside <= 1.0
 
 
+@torch.no_grad()
+def f_number(light: "ElementLight", n: int) -> float:
+    """Return the reduced distance to the sensor over the width of a point's light."""
+    low, high = lit_box(light, n)
+    return float(reduced_distance(light.layers(n))) / float((high - low).max())
+
+
+@torch.no_grad()
+def ray_radius(light: "ElementLight", n: int) -> float:
+    """Return how far from the window's centre rays' order lands, mm: √2 of the RMS, which is
+    the edge of an even disc.
+    """
+    low, high = lit_box(light, n)
+    x, y = coarse(low, high)
+    slopes, lit = turned_slopes(light, n, x, y)
+    spread = torch.zeros((), dtype=torch.float64)
+    ways = [(x - light.centre[n, 0])[None].expand_as(lit), (y - light.centre[n, 1])[:, None]]
+    for layer in light.layers(n):
+        normal = (layer.index**2 - slopes.square().sum(0)).clamp(min=1e-6).sqrt()
+        ways = [
+            way + float(layer.thickness) * slope / normal
+            for way, slope in zip(ways, slopes, strict=True)
+        ]
+    for way in ways:
+        spread = spread + way[lit].square().mean()
+    return math.sqrt(2.0 * float(spread))
+
+
 def coarse(low: Tensor, high: Tensor) -> list[Tensor]:
     """Return columns and rows of a few points between corners (2,)."""
     ends = zip(low.tolist(), high.tolist(), strict=True)

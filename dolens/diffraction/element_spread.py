@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.spot_diagram import AIRY
 from dolens.diffraction.element_orders import OrdersSpread, light_goes_by_orders
+from dolens.diffraction.element_plan import f_number, ray_radius
 from dolens.diffraction.element_waves import ElementLight, element_light
 from dolens.diffraction.field_wavefronts import object_points
 from dolens.diffraction.propagation import DiffractionSettings
@@ -53,7 +54,7 @@ class ElementSpread:
         """
         light = self.light
         radii = [
-            AIRY * float(light.fit.wavefront.wavelength[n]) * light.f_number(n)
+            AIRY * float(light.fit.wavefront.wavelength[n]) * f_number(light, n)
             for n in range(len(light))
         ]
         share = self.weights / self.weights.sum()
@@ -63,7 +64,7 @@ class ElementSpread:
     def half_width(self) -> float:
         """Return the half width, mm, of a window that holds rays' order and rings around it."""
         airy = 1e-3 * self.airy_radius_um
-        rays = max(self.light.ray_radius(n) for n in range(len(self.light)))
+        rays = max(ray_radius(self.light, n) for n in range(len(self.light)))
         return min(rays, _RAYS * airy) + _BEYOND * airy
 
     def reason(self, half: float) -> str:

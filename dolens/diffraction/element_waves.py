@@ -22,13 +22,10 @@ from torch import Tensor
 from dolens.diffraction.element_cut import cut_at, element_number
 from dolens.diffraction.element_plan import (
     Plan,
-    coarse,
-    lit_box,
     phase_at,
     plan_of,
     slopes_at,
     towards_centre,
-    turned_slopes,
     turns_to,
 )
 from dolens.diffraction.entrance_beam import ObjectPoints
@@ -134,32 +131,6 @@ class ElementLight:
     def plan(self, n: int, half_window: float) -> Plan:
         """Return method, grid and errors of one point's light; see `plan_of`."""
         return plan_of(self, n, half_window)
-
-    @torch.no_grad()
-    def f_number(self, n: int) -> float:
-        """Return the reduced distance to the sensor over the width of a point's light."""
-        low, high = lit_box(self, n)
-        return float(reduced_distance(self.layers(n))) / float((high - low).max())
-
-    @torch.no_grad()
-    def ray_radius(self, n: int) -> float:
-        """Return how far from the window's centre rays' order lands, mm: √2 of the RMS, which is
-        the edge of an even disc.
-        """
-        low, high = lit_box(self, n)
-        x, y = coarse(low, high)
-        slopes, lit = turned_slopes(self, n, x, y)
-        spread = torch.zeros((), dtype=torch.float64)
-        ways = [(x - self.centre[n, 0])[None].expand_as(lit), (y - self.centre[n, 1])[:, None]]
-        for layer in self.layers(n):
-            normal = (layer.index**2 - slopes.square().sum(0)).clamp(min=1e-6).sqrt()
-            ways = [
-                way + float(layer.thickness) * slope / normal
-                for way, slope in zip(ways, slopes, strict=True)
-            ]
-        for way in ways:
-            spread = spread + way[lit].square().mean()
-        return math.sqrt(2.0 * float(spread))
 
     @torch.no_grad()
     def perfect(self, n: int, plan: Plan) -> float:

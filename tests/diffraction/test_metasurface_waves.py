@@ -17,6 +17,7 @@ from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
 from dolens.optics.diffractive import lens_phase, order_efficiencies
 from dolens.optics.metasurface import CellTable
+from dolens.optimize import DesignVariables
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.cells import cell_rows, cell_widths
 from tests.optics.nanopillars import FILMS, effective
@@ -126,6 +127,24 @@ def test_derivatives_by_widths_are_those_of_differences(shape):
     with torch.no_grad():
         ends = [float(loss(widths + 1e-3 * sign * way)) for sign in (1, -1)]
     assert float((gradient * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-4)
+
+
+def test_widths_are_learned_within_their_table():
+    # A metalens that focuses at 0.2 mm is trained for 0.1 mm, with steps as long as the table.
+    widths = cell_widths(FILMS, lens_phase(0.2, 532.0, 0.02), 532.0, 0.001)
+    lens, window = plate(widths, 0.001, 0.02, 0.1), PixelWindow(0.001, 3)
+    variables = DesignVariables(lens, {CELLS: {"scale": 50.0}})
+    adam, bright = torch.optim.Adam(variables.parameters(), lr=0.3), []
+    for _ in range(12):
+        kernel = wave_kernels(lens.system(variables()), ON_AXIS, 532.0, None, window)
+        bright.append(float(kernel.detach()[0, 1, 1]))
+        adam.zero_grad()
+        (-kernel[0, 1, 1]).backward()
+        adam.step()
+        variables.project()
+    assert bright[-1] > 3.0 * bright[0]
+    learned = variables()[CELLS].detach()
+    assert (float(learned.min()), float(learned.max())) == pytest.approx((60.0, 230.0))
 
 
 def test_the_share_that_leaves_cells_has_its_derivative():
