@@ -15,6 +15,7 @@ lens file may name such a file, which is looked for beside it; a prescription na
 one from a stranger reads nothing.
 """
 
+import copy
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,12 +29,13 @@ from dolens.errors import InputError, check_keys
 from dolens.files import decode_text, read_file
 from dolens.optics.metasurface import Cells, CellTable, Metasurface
 from dolens.optics.surfaces.base import Surface, tensor_of
+from dolens.optics.surfaces.phase import Phase
 from dolens.prescriptions.numbers import as_number, as_numbers, as_positive, number_in_text
 from dolens.prescriptions.plain_values import plain_values
 from dolens.prescriptions.row_data import phase_from
 
 TABLE_KEY = "cells"
-CELL_KEYS = (TABLE_KEY, "pitch", "widths")
+CELL_KEYS = (TABLE_KEY, "pitch", "widths", "design_wavelength")
 _COLUMNS = (
     ("width_nm",),
     ("wavelength_nm",),
@@ -45,6 +47,8 @@ _YAML, _TEXT = (".yaml", ".yml"), (".csv", ".txt")
 _MOST_BYTES, _MOST_ROWS = 64 * 2**20, 200_000
 # A solver's share of power may exceed one by so much.
 _ABOVE_ONE = 1e-3
+# Cells from the vertex to the side; waves pass no more.
+_MOST_CELLS = 2048
 # Widths that are tried, and phases within a turn that they are found for.
 _TRIED, _PHASES = 2048, 2048
 
@@ -131,17 +135,29 @@ def metasurface_from(
     check_keys(row, CELL_KEYS, where)
     if surface.kind not in ("plane", "aperture"):
         raise InputError(f"a surface of type '{surface.kind}' cannot have 'cells'; allowed: plane")
-    for key in CELL_KEYS:
+    for key in (TABLE_KEY, "pitch"):
         if row.get(key) is None:
-            raise InputError(f"'{key}' is missing; cells need {', '.join(CELL_KEYS)}")
+            raise InputError(f"'{key}' is missing; cells need it")
     if isinstance(row[TABLE_KEY], str):
         raise InputError(
             f"'{TABLE_KEY}': '{row[TABLE_KEY]}' is a file's name, which lens files and experiments "
             "may give; prescriptions as data have its rows (cell_rows(read_cells(file)))"
         )
     table = cell_table(row[TABLE_KEY], f"'{TABLE_KEY}'")
-    widths = tensor_of(as_numbers(row["widths"], "'widths'"), "widths", dtype)
-    cells = Cells(table, widths, as_number(row["pitch"], "'pitch'"))
+    given, wave, pitch = row.get("widths"), row.get("design_wavelength"), row["pitch"]
+    if (given is None) == (wave is None):
+        raise InputError("give 'widths', or the 'design_wavelength' of a 'phase' that makes them")
+    if given is not None:
+        widths = tensor_of(as_numbers(given, "'widths'"), "widths", dtype)
+    elif surface.phase is None:
+        raise InputError("'design_wavelength' makes widths of a 'phase', and there is none")
+    elif not surface.aperture.clips:
+        raise InputError("'design_wavelength' needs a 'semi_diameter', mm, which ends the cells")
+    else:
+        law, nm = copy.deepcopy(surface.phase).double(), as_number(wave, "'design_wavelength'")
+        sizes = as_positive(pitch, "'pitch'"), surface.semi_diameter
+        widths = _widths_of(law, table, nm, *sizes).to(dtype)
+    cells = Cells(table, widths, as_number(pitch, "'pitch'"))
     found = Metasurface(cells, dtype)
     cells.check([], where)
     return found
@@ -219,11 +235,25 @@ def cell_widths(
     law = phase_from(phase, "phase", torch.float64)
     reach = phase.get("norm_radius") if semi_diameter is None else semi_diameter
     reach, pitch = as_positive(reach, "'semi_diameter'"), as_positive(pitch, "'pitch'")
+    return _widths_of(law, table, wavelength, pitch, reach, rings)
+
+
+def _widths_of(
+    law: Phase,
+    table: CellTable,
+    wavelength: float,
+    pitch: float,
+    reach: float,
+    rings: bool = False,
+) -> Tensor:
+    """Return widths for a phase; arguments as of `cell_widths`."""
     low, high = float(table.widths[0]), float(table.widths[-1])
     tried = torch.linspace(low, high, _TRIED, dtype=torch.float64)
     Cells(table, tried, pitch).check([wavelength], "widths of cells")
     parameters = {**dict(law.named_parameters()), **dict(law.named_buffers())}
     half = math.ceil(reach / pitch - 1e-9)
+    if half > _MOST_CELLS:
+        raise InputError(f"{2 * half} cells a side are too many; allowed: {2 * _MOST_CELLS}")
     at = (torch.arange(half, dtype=torch.float64) + 0.5) * pitch
     across, down = at, torch.zeros(1, dtype=torch.float64)
     if not rings:

@@ -6,13 +6,16 @@ import torch
 import yaml
 
 from dolens import InputError, load_lens, save_lens
+from dolens.optics.diffractive import lens_phase
 from dolens.optimize import DesignVariables
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.cells import cell_rows, cell_table, read_cells
+from dolens.prescriptions.cells import cell_rows, cell_table, cell_widths, read_cells
 
 HEAD = ["width_nm", "wavelength_nm", "phase_rad", "power"]
 ROWS = [HEAD, [80, 500, 0.3, 0.9], [120, 500, 1.4, 0.8], [80, 600, 0.2, 1.0], [120, 600, 1.1, 0.7]]
 CELLS = {"cells": ROWS, "pitch": 0.0004, "widths": [[85.5, 90.25], [100.0, 120.0]]}
+
+PHASE = lens_phase(8.0, 550.0, 1.0)
 
 
 def prescription(diffractive=CELLS, **row):
@@ -111,7 +114,15 @@ def test_files_of_other_programs_cannot_hold_cells(suffix, tmp_path):
     [
         (changed(widths=[[79.0, 90.0]]), {},
          "widths of 79 to 90 nm; the table of cells holds 80 to 120 nm"),
-        (changed(widths=None), {}, "'widths' is missing; cells need cells, pitch, widths"),
+        (changed(widths=None), {}, "give 'widths', or the 'design_wavelength' of a 'phase'"),
+        (changed(design_wavelength=550), {}, "give 'widths', or the 'design_wavelength'"),
+        (changed(widths=None, design_wavelength=550), {}, "of a 'phase', and there is none"),
+        (changed(widths=None, design_wavelength=550), {"phase": PHASE, "semi_diameter": "auto"},
+         "'design_wavelength' needs a 'semi_diameter'"),
+        (changed(widths=None, design_wavelength=700), {"phase": PHASE},
+         "wavelengths of 700 nm; the table of cells holds 500 to 600 nm"),
+        (changed(widths=None, design_wavelength=550, pitch=1e-4), {"phase": PHASE},
+         "20000 cells a side are too many; allowed: 4096"),
         (changed(pitch=None), {}, "'pitch' is missing"),
         (changed(pitch=-1), {}, "'pitch' must be given and positive"),
         (changed(widths=[[[90]]]), {}, "'widths' must be rows of numbers"),
@@ -173,6 +184,22 @@ def test_optimizers_keep_widths_within_the_table(dtype):
     # Limits of one's own count where they are narrower.
     with pytest.raises(InputError, match=r"initial value 120 is outside its bounds \[80, 110\]"):
         DesignVariables(lens, {name: {"upper": 110.0}})
+
+
+def test_a_phase_and_a_wavelength_make_widths():
+    element = changed(widths=None, design_wavelength=550, pitch=0.05)
+    for dtype in (torch.float64, torch.float32):
+        lens = lens_from_prescription(prescription(element, phase=PHASE), dtype)
+        found = lens.surfaces["2"].diffractive.widths.detach()
+        table = lens.surfaces["2"].diffractive.table
+        wanted = cell_widths(table, PHASE, 550.0, 0.05, 1.0).to(dtype)
+        assert float((found == wanted).double().mean()) > 0.99
+        assert found.shape == (40, 40)
+        assert float(found.max() - found.min()) > 20.0
+        # Written as they are, since they may be learned.
+        written = prescription_of(lens)["surfaces"]["2"]["diffractive"]
+        assert written["widths"] == found.tolist()
+        assert "design_wavelength" not in written
 
 
 def test_a_lens_says_what_cells_it_has():
