@@ -137,12 +137,12 @@ def orders_of(system: OpticalSystem, points: ObjectPoints, wavelengths: Tensor) 
         assert isinstance(share, Tensor)
         if bool((share > _LEAST).any()):
             numbers = tuple(each[k] for each, k in zip(orders, places, strict=True))
-            together.append(Order(numbers, share, _bent(system, numbers)))
+            together.append(Order(numbers, share, bent_to(system, numbers)))
     return sorted(together, key=lambda order: -float(order.share.max()))
 
 
-def _bent(system: OpticalSystem, numbers: tuple[int, ...]) -> OpticalSystem:
-    """Return the lens whose phases bend light in these orders."""
+def bent_to(system: OpticalSystem, numbers: tuple[int, ...]) -> OpticalSystem:
+    """Return the lens whose phases bend light in these orders of its elements, with no relief."""
     surfaces = list(system.surfaces)
     for number, order in zip(system.diffractive, numbers, strict=True):
         surface = surfaces[number - 1]

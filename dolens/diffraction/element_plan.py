@@ -1,4 +1,4 @@
-"""How the light of a diffractive element is computed: method, grid and errors of one point."""
+"""How the light of a diffractive element is computed: method and grid of one point."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from dolens.diffraction.free_space import Layer, fourier_error, reduced_distance, to_centre
+from dolens.diffraction.free_space import Layer, reduced_distance
 from dolens.diffraction.pupil_fit import PupilFit, chebyshev
 from dolens.diffraction.wavefront import MM_PER_NM
 from dolens.errors import InputError
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 # Cells to a turn of the phase, to a ring or zone, by the settings' `oversampling` of two; fewest
 # and most cells along a side.
 _TWO, _FEWEST, _MOST = 2.0, 96, 4096
-# Of the settings' phase error, what one Fourier transform may make.
-_SHARE = 0.5
 # Points that say how steep phases are, and cells that find the light's edge, along each side.
 _COARSE, _SEARCH = 33, 128
 
@@ -33,8 +31,7 @@ class Plan:
     """How the light of one point is computed.
 
     Attributes:
-        method: `fourier`, `spectrum` or `direct`.
-        phase_error: waves, that `fourier` errs by at most; infinite behind plates.
+        method: `spectrum` or `direct`.
         cell: mm, of the grid on the element.
         count: cells along each side.
         start: mm, x and y where the grid begins.
@@ -43,7 +40,6 @@ class Plan:
     """
 
     method: str
-    phase_error: float
     cell: float
     count: int
     start: tuple[float, float]
@@ -55,13 +51,13 @@ class Plan:
         """Return the choice in words."""
         return (
             f"{self.method}: {self.count} × {self.count} cells of {1e3 * self.cell:.3g} µm on a "
-            f"diffractive element; one Fourier transform errs by {self.phase_error:.2g} waves"
+            "diffractive element"
         )
 
 
 @torch.no_grad()
 def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
-    """Return method, grid and errors of one point's light.
+    """Return method and grid of one point's light.
 
     Args:
         light: of the points.
@@ -69,27 +65,25 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
         half_window: mm, from the window's centre to its sides.
 
     Raises:
-        InputError: more cells are needed than can be computed.
+        InputError: more cells are needed than can be computed, or a method that does not serve.
     """
     fit, relief, settings = light.fit, light.relief, light.settings
     low, high = lit_box(light, n)
     wavelength, layers = float(fit.wavefront.wavelength[n]), light.layers(n)
-    wave, centre = MM_PER_NM * wavelength, light.centre[n].tolist()
+    wave = MM_PER_NM * wavelength
     x, y = coarse(low, high)
-    error = math.inf
-    if len(layers) == 1:
-        error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
-    method = settings.method
-    if method == "auto":
-        method = "fourier" if error <= _SHARE * settings.phase_error else "spectrum"
+    method = "spectrum" if settings.method == "auto" else settings.method
+    if method == "fourier":
+        raise InputError(
+            "method fourier is not that of light behind a diffractive element; allowed: auto, "
+            "spectrum, direct"
+        )
     if method != "spectrum" and len(layers) > 1:
         raise InputError(f"method {method}: there are plates behind; allowed: spectrum")
     slopes = torch.stack(slopes_at(fit, n, x, y))
     behind, lit = turned_slopes(light, n, x, y)
     carrier = slopes[:, lit].mean(-1)
-    towards = towards_centre(x, y, centre, layers)
-    left = behind - (towards if method == "fourier" else carrier[:, None, None])
-    turned = behind - slopes
+    left, turned = behind - carrier[:, None, None], behind - slopes
     if light.law is not None and isinstance(relief, Relief):
         turned = turned / round(float(light.law.parameters["order"]))
     steepest = float(torch.where(lit, torch.maximum(left.abs(), turned.abs()), 0.0).max())
@@ -119,7 +113,7 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     reach = width + 2.0 * half_window
     band = min(1.0 / cell, reach / (wave * float(reduced_distance(layers))))
     tilt = float(carrier[0]), float(carrier[1])
-    return Plan(method, error, cell, count, (starts[0], starts[1]), tilt, band)
+    return Plan(method, cell, count, (starts[0], starts[1]), tilt, band)
 
 
 def lit_box(light: "ElementLight", n: int) -> tuple[Tensor, Tensor]:
@@ -127,7 +121,7 @@ def lit_box(light: "ElementLight", n: int) -> tuple[Tensor, Tensor]:
     low, high = light.fit.low[n], light.fit.high[n]
     side = (high - low).amax() / _SEARCH
     start = float(low[0]), float(low[1])
-    plan = Plan("", 0.0, float(side), _SEARCH, start, (0.0, 0.0), 0.0)
+    plan = Plan("", float(side), _SEARCH, start, (0.0, 0.0), 0.0)
     lit = light.pupil(n, plan, (0.0, 0.0), torch.float64).amplitude[0] > 0.0
     if not bool(lit.any()):
         return low, high
@@ -192,13 +186,6 @@ def slopes_at(fit: PupilFit, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tens
     )
     half = fit.half_width[n]
     return (b.mT @ table @ da) / half[0], (db.mT @ table @ a) / half[1]
-
-
-def turns_to(
-    x: Tensor, y: Tensor, layer: Layer, centre: Sequence[float], wavelength: float
-) -> Tensor:
-    """Return n·(R - z)/λ of places to a window's centre, as `to_centre` has it."""
-    return to_centre(x.flatten(), y.flatten(), layer, centre, wavelength)[0]
 
 
 def phase_at(law: LawState, x: Tensor, y: Tensor) -> PhaseOnGrid:

@@ -26,13 +26,11 @@ from dolens.diffraction.element_plan import (
     plan_of,
     slopes_at,
     towards_centre,
-    turns_to,
 )
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.free_space import (
     Layer,
     PlaneField,
-    by_fourier,
     by_spectrum,
     by_summation,
     on_grid,
@@ -129,7 +127,7 @@ class ElementLight:
         return range(self.number, len(self.system.materials))
 
     def plan(self, n: int, half_window: float) -> Plan:
-        """Return method, grid and errors of one point's light; see `plan_of`."""
+        """Return method and grid of one point's light; see `plan_of`."""
         return plan_of(self, n, half_window)
 
     @torch.no_grad()
@@ -173,10 +171,7 @@ class ElementLight:
         layers, centre = self.layers(n), self.centre[n].tolist()
         wavelength = float(self.fit.wavefront.wavelength[n])
         values, x, y = self.behind(n, plan, dtype)
-        carrier = (0.0, 0.0) if plan.method == "fourier" else plan.carrier
-        found = PlaneField(values, x, y, wavelength, carrier)
-        if plan.method == "fourier":
-            return by_fourier(found, layers[0], centre, u, v, focused=True)
+        found = PlaneField(values, x, y, wavelength, plan.carrier)
         if plan.method == "spectrum":
             return by_spectrum(found, layers, centre, u, v)
         rows, columns = torch.meshgrid(v + centre[1], u + centre[0], indexing="ij")
@@ -227,21 +222,15 @@ class ElementLight:
     def behind(self, n: int, plan: Plan, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
 
-        The phase is less the carrier's tilt; for the method `fourier` it is that of the field times
-        exp(ikn·R), with R the distance to the window's centre.  Arguments as of `field`.
+        The phase is less the carrier's tilt.  Arguments as of `field`.
         """
         relief, layers, centre = self.relief, self.layers(n), self.centre[n].tolist()
         wavelength = float(self.fit.wavefront.wavelength[n])
         wave = MM_PER_NM * wavelength
         steps = (torch.arange(plan.count).to(self.centre) + 0.5) * plan.cell
         x, y = steps + plan.start[0], steps + plan.start[1]
-        fourier = plan.method == "fourier"
-        pupil = self.pupil(n, plan, (0.0, 0.0) if fourier else plan.carrier, dtype)
+        pupil = self.pupil(n, plan, plan.carrier, dtype)
         turns, amplitude = pupil.opd[0], pupil.amplitude[0]
-        if fourier:
-            turns = turns + on_grid(
-                lambda x, y: turns_to(x, y, layers[0], centre, wavelength), x, y, dtype
-            )
 
         def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
             gain = torch.ones((), dtype=torch.float64)

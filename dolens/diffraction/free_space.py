@@ -1,6 +1,6 @@
 """Light goes from one plane to another through plane layers of media, as a scalar wave.
 
-A field U, time going as exp(-iωt), is carried by one of three methods, all of which are the first
+A field U, time going as exp(-iωt), is carried by one of two methods, both of which are the first
 Rayleigh-Sommerfeld integral
 
     U(ρ) = 1/2π·∫ U(x)·(z/r)·(1/r - ikn)·exp(iknr)/r d²x,    r² = |ρ - x|² + z²,
@@ -11,11 +11,6 @@ the field into the window (Matsushima and Shimobaba, Opt. Express 17, 19662, 200
 Matsushima, Opt. Express 18, 18453, 2010), with a smooth edge of the band; the field is padded by
 the window and that edge, and the window has samples of its own, by a matrix Fourier transform.  It
 holds at every distance and angle.
-
-`fourier`: with R the distance from x to the window's centre, r - R is taken as linear in x and in
-the distance from that centre, so that one Fourier transform remains, of the field times
-exp(iknR)·z/R².  It is Fresnel's integral with exact distances to the window's centre;
-`fourier_error` says what it leaves out.
 
 `direct`: the integral itself, in double precision, as the reference.
 """
@@ -303,111 +298,6 @@ def _band(
         first.append(max(low - axis.tilt, -axis.highest))
         last.append(min(high - axis.tilt, axis.highest - axis.step))
     return first, last
-
-
-def by_fourier(
-    field: PlaneField,
-    layer: Layer,
-    centre: Sequence[float],
-    u: Tensor,
-    v: Tensor,
-    focused: bool = False,
-) -> Tensor:
-    """Carry a field to a window by one Fourier transform; arguments as of `by_spectrum`.
-
-    Args:
-        field: see `by_spectrum`; so are the others.
-        layer: the one layer.
-        centre: of the window.
-        u: see centre.
-        v: see centre.
-        focused: the field's values hold the phase of `to_centre` already.
-    """
-    wave = MM_PER_NM * field.wavelength / layer.index
-    turns, distance = to_centre(field.x, field.y, layer, centre, field.wavelength, field.carrier)
-    gain = field.pitch**2 / wave * layer.thickness / distance.square()
-    values = field.values
-    values = values * (gain.to(values.real) if focused else phasor(turns, values.real.dtype, gain))
-    scales, starts = _linear(field.x, field.y, layer.thickness, centre)
-    e_u, e_v = (
-        phasor(-w[:, None] * ((at - start) * scale / wave), values.real.dtype)
-        for w, at, start, scale in zip((u, v), (field.x, field.y), starts, scales, strict=True)
-    )
-    return _product(e_v, values, e_u)
-
-
-def to_centre(
-    x: Tensor,
-    y: Tensor,
-    layer: Layer,
-    centre: Sequence[float],
-    wavelength: float,
-    carrier: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Tensor, Tensor]:
-    """Return the turns n·(R - R0)/λ and a tilt's (Y, X), and R (mm), to a window's centre."""
-    across, down = (x - float(centre[0])).square(), (y - float(centre[1])).square()
-    square = across[None] + down[:, None]
-    z = layer.thickness.double()
-    distance = (square + z * z).sqrt()
-    # Without the difference of two large numbers.
-    turns = square / (distance + z) * (layer.index / (MM_PER_NM * wavelength))
-    if any(carrier):
-        tilt = [c / (MM_PER_NM * wavelength) for c in carrier]
-        turns = turns + (x * tilt[0])[None] + (y * tilt[1])[:, None]
-    return turns, distance
-
-
-def _linear(
-    x: Tensor, y: Tensor, z: Tensor, centre: Sequence[float]
-) -> tuple[tuple[Tensor, Tensor], tuple[float, float]]:
-    """Return the slopes 1/mm of the cosine towards the centre, and the middle of the field."""
-    middle = 0.5 * float(x[0] + x[-1]), 0.5 * float(y[0] + y[-1])
-    away = [m - float(c) for m, c in zip(middle, centre, strict=True)]
-    distance = (z.double().square() + away[0] ** 2 + away[1] ** 2).sqrt()
-    first, second = ((1.0 - (a / distance).square()) / distance for a in away)
-    return (first, second), middle
-
-
-@torch.no_grad()
-def fourier_error(
-    x: Tensor,
-    y: Tensor,
-    layer: Layer,
-    centre: Sequence[float],
-    half_window: float,
-    wavelength: float,
-) -> float:
-    """Return the largest phase in waves that `by_fourier` errs by, half of its range over a field.
-
-    Args:
-        x: (X,), mm, of the field's columns; only its ends count.
-        y: (Y,), mm, of its rows.
-        layer: the one layer.
-        centre: of the window, mm.
-        half_window: mm, from its centre to its sides.
-        wavelength: nm, in vacuum.
-    """
-    across, down = (
-        torch.linspace(float(at[0]), float(at[-1]), _COARSE, dtype=torch.float64) for at in (x, y)
-    )
-    z = float(layer.thickness)
-    scales, starts = _linear(x, y, layer.thickness, centre)
-    # Light fills a round beam, or a part of one.
-    unit = torch.linspace(-1.0, 1.0, _COARSE, dtype=torch.float64)
-    lit = unit.square()[None] + unit.square()[:, None] <= 1.0
-    dx, dy = (across - float(centre[0]))[None], (down - float(centre[1]))[:, None]
-    distance = (dx * dx + dy * dy + z * z).sqrt()
-    worst = 0.0
-    for a, b in ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1)):
-        u, v = a * half_window, b * half_window
-        exact = (u * u + v * v - 2.0 * (u * dx + v * dy)) / (
-            ((dx - u).square() + (dy - v).square() + z * z).sqrt() + distance
-        )
-        linear = -((across - starts[0]) * (scales[0] * u))[None]
-        linear = linear - ((down - starts[1]) * (scales[1] * v))[:, None]
-        left = (exact - linear)[lit]
-        worst = max(worst, 0.5 * float(left.max() - left.min()))
-    return worst * layer.index / (MM_PER_NM * wavelength)
 
 
 def by_summation(

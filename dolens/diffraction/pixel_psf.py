@@ -230,10 +230,10 @@ def _element_propagation(light: ElementLight, window: PixelWindow) -> Propagatio
     plans = [light.plan(n, window.half_width) for n in range(len(light))]
     none = torch.zeros_like(light.fit.residual)
     return Propagation(
-        fourier=torch.tensor([plan.method == "fourier" for plan in plans]),
+        fourier=torch.zeros(len(plans), dtype=torch.bool),
         reasons=tuple(plan.reason for plan in plans),
         fit_residual=light.fit.residual,
-        sphere_term=torch.tensor([plan.phase_error for plan in plans]).to(none),
+        sphere_term=none,
         distortion=none,
         flux_error=none,
         samples=max(plan.count for plan in plans),

@@ -27,6 +27,7 @@ from dolens.optics.ray_tracing import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem, require_seen_by_rays
 from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.order_functions import functions_of_orders
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -91,6 +92,7 @@ def field_point_spread_functions(
     seed: int | None,
     distortion: bool,
     among: PointShare | None = None,
+    orders: bool = False,
 ) -> FieldPointSpreadFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -108,6 +110,8 @@ def field_point_spread_functions(
         distortion: whether a function's centre is where the chief ray meets the plane, else where
             a pinhole sees it.
         among: all points, where these are a part of them and are to have the same samples.
+        orders: whether light goes in all orders of diffractive elements (see
+            `functions_of_orders`), or all in that of rays.
 
     Centres move with the lens, and so do the functions about them: gradients are of both, and where
     pixels look has to carry its own (`convolve_patches`).
@@ -116,14 +120,32 @@ def field_point_spread_functions(
     require_seen_by_rays(system, "renderer psf")
     places = _places(points, among, system.rotationally_symmetric)
     disc = sampled_disc(places, pupil_samples, seed, system)
-    seen = plane_points(imaging, points, disc)
     centre = _centres(imaging, points, distortion)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
-    return splat_plane_points(
-        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
-        size,
-        cpu_kernels_serve(system),
-    )
+
+    def by_rays(imaging: ImagingSystem) -> FieldPointSpreadFunctions:
+        seen = plane_points(imaging, points, disc)
+        about = PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight)
+        return splat_plane_points(about, size, cpu_kernels_serve(system))
+
+    return _of_orders(imaging, points, centre, by_rays) if orders else by_rays(imaging)
+
+
+def _of_orders(
+    imaging: ImagingSystem,
+    points: tuple[Tensor, Tensor],
+    centre: tuple[Tensor, Tensor],
+    by_rays: Callable[[ImagingSystem], FieldPointSpreadFunctions],
+) -> FieldPointSpreadFunctions:
+    """Return `functions_of_orders` of points whose functions are centred on places of the scene."""
+
+    def functions_and_light(imaging: ImagingSystem) -> tuple[Tensor, Tensor]:
+        found = by_rays(imaging)
+        return found.functions, found.light[:, None]
+
+    places, waves, _ = object_points(imaging, points, centre)
+    found, light, lost = functions_of_orders(imaging, places.detach(), waves, functions_and_light)
+    return FieldPointSpreadFunctions(found, light[:, 0], lost)
 
 
 def splat_plane_points(seen: PlanePoints, size: int, fused: bool) -> FieldPointSpreadFunctions:
@@ -378,7 +400,8 @@ def place_functions(
         ideal: what the ideal camera sees there.
         size: K, odd; light beyond is given back in proportion, and that of a diffractive element's
             other orders evenly.
-        diffraction: `none`; `limit`: blurred by a perfect pupil's; `wave`: of the wavefront.
+        diffraction: `none`; `limit`: blurred by a perfect pupil's; `orders`: the same of all orders
+            of diffractive elements; `wave`: of the wavefront.
         samples: strata along each side of the pupil.
 
     Returns:
@@ -400,7 +423,7 @@ def place_functions(
         kernels, _, kept = _wave_kernels(system, places, PixelWindow(pitch, size))
         functions = kernels.reshape_as(functions)
         light = light * kept.reshape(functions.shape[:3]).mean(1)
-    elif diffraction == "limit":
+    elif diffraction in ("limit", "orders"):
         f_number = working_f_number(imaging.pupil, system.vertices[-1])
         functions = with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
     total = functions.sum((-2, -1), keepdim=True)

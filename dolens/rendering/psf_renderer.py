@@ -67,7 +67,8 @@ class PsfRenderer(Renderer):
         depths: `each` has functions of its own, or `one`, the middle in vergence, serves all.
         colours: `each` wavelength has functions of its own, or `one`, the middle, serves all.
         diffraction: `none`: geometric functions; `limit`: these blurred by a perfect pupil's
-            diffraction; `wave`: functions of the pupil's wavefront.
+            diffraction; `orders`: the same, with light in all orders of diffractive elements;
+            `wave`: functions of the pupil's wavefront.
         band: nm from each of the scene's wavelengths, whose light a colour has in equal parts, with
             diffraction `wave`; (0,) is the scene's wavelength alone.
         pupil: the disc that is sampled; None looks for it at each render, for the lens as it is.
@@ -83,7 +84,7 @@ class PsfRenderer(Renderer):
     depths: Literal["each", "one"] = "each"
     colours: Literal["each", "one"] = "each"
     jitter: bool = True
-    diffraction: Literal["none", "limit", "wave"] = "none"
+    diffraction: Literal["none", "limit", "orders", "wave"] = "none"
     pupil: ExitPupil | None = None
     band: tuple[float, ...] = (0.0,)
 
@@ -110,7 +111,7 @@ class PsfRenderer(Renderer):
             ("illumination", ("map", "functions")),
             ("depths", ("each", "one")),
             ("colours", ("each", "one")),
-            ("diffraction", ("none", "limit", "wave")),
+            ("diffraction", ("none", "limit", "orders", "wave")),
         ):
             check_choice(getattr(self, key), allowed, f"renderer: {key}")
 
@@ -272,6 +273,7 @@ class PsfRenderer(Renderer):
             seed if self.jitter else None,
             centred,
             among,
+            self.diffraction == "orders",
         )
         if self.diffraction == "none":
             return found

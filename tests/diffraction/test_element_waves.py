@@ -54,10 +54,9 @@ def steps(count, width):
     return (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * (width / (count - 1))
 
 
-@pytest.mark.parametrize("method", ["fourier", "spectrum"])
-def test_a_kinoform_at_its_wavelength_is_a_perfect_lens(method):
+def test_a_kinoform_at_its_wavelength_is_a_perfect_lens():
     u = steps(61, 0.03)
-    found = irradiance(kinoform(), ON_AXIS, u, method=method)
+    found = irradiance(kinoform(), ON_AXIS, u)
     sine = 0.5 / math.hypot(8.0, 0.5)
     v = 2 * math.pi / 550e-6 * sine * u.abs().clamp(min=1e-9).numpy()
     airy = (2 * j1(v) / v) ** 2 * math.pi * sine**2 / 550e-6**2
@@ -196,8 +195,7 @@ def test_light_lands_where_rays_of_the_first_order_do():
     assert (x, y) == pytest.approx((float(rays[0]), float(rays[1])), abs=3e-3)
 
 
-@pytest.mark.parametrize("method", ["fourier", "spectrum"])
-def test_gradients_are_those_of_differences(method):
+def test_gradients_are_those_of_differences():
     heights = smooth_heights(40, 0.01, 5.0)
     element = {"pixels": heights.tolist(), "pitch": 0.01}
     front = {"type": "sphere", "radius": 40.0, "semi_diameter": 0.25, "thickness": 0.5}
@@ -207,7 +205,7 @@ def test_gradients_are_those_of_differences(method):
          "sensor": {"distance": 4.8}}
     )  # fmt: skip
     points, window = ObjectPoints.at_infinity([[0.5, 1.0]]), PixelWindow(0.003, 9)
-    settings = DiffractionSettings(method=method)
+    settings = DiffractionSettings()
     weights = torch.linspace(0.3, 1.0, 81, dtype=torch.float64).reshape(9, 9)
     names = ("surfaces.2.diffractive.heights", "surfaces.1.curvature", "sensor_distance")
 
@@ -291,7 +289,7 @@ def test_views_show_all_orders():
     lens = kinoform()
     where = conditions(lens, [[0.0, 0.0]], [480.0, 550.0])
     found = point_spread(lens, where)
-    assert found.reasons[0].startswith("fourier")
+    assert found.reasons[0].startswith("spectrum: ")
     assert found.diffraction == (True,)
     assert float(found.sampling_error) < 0.01
     only = point_spread(lens, conditions(lens, [[0.0, 0.0]], [550.0]))
@@ -306,12 +304,13 @@ def test_views_show_all_orders():
     np.testing.assert_allclose(curves.tangential[0].numpy(), perfect, atol=0.02)
 
 
-def test_the_choice_of_propagation_is_said():
+def test_the_way_of_propagation_is_said():
     lens = kinoform()
-    found = propagation(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.002, 25))
-    assert bool(found.fourier.all())
-    wide = propagation(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.02, 65))
-    assert wide.reasons[0].startswith("spectrum: ")
+    found = propagation(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.02, 65))
+    assert found.reasons[0].startswith("spectrum: ")
+    settings = DiffractionSettings(method="fourier")
+    with pytest.raises(InputError, match=r"method fourier .* allowed: auto, spectrum, direct"):
+        wave_kernels(lens.system(), ON_AXIS, 550.0, None, PixelWindow(0.002, 9), settings)
 
 
 def test_rays_refuse_what_they_do_not_see():

@@ -5,13 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
 from dolens.experiments.camera.views.depths import DepthViews
-from dolens.optics.diffractive import lens_phase
+from dolens.optics.diffractive import lens_phase, order_efficiencies
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.cells import cell_table, cell_widths
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.psf_grid import wave_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -133,12 +135,42 @@ def test_a_network_is_told_waves_where_asked():
     assert float(told[0, 1].sum()) == pytest.approx(float(rays[0, 1].sum()), rel=0.02)
 
 
+@pytest.mark.parametrize(("levels", "wavelength"), [(2, 550.0), (4, 550.0), (None, 450.0)])
+def test_rays_of_every_order_make_what_waves_make(levels, wavelength):
+    """Pixels are as wide as the Airy disc: what is left is where the light of orders goes."""
+    given = {} if levels is None else {"levels": levels}
+    lens = flat_lens(**given)
+    sensor = Sensor(33, 33, 0.02)
+    scene = replace(SCENE, wavelengths=(wavelength,))
+    imaging = ImagingSystem.of(lens.system(), scene, sensor)
+    by_orders, by_one = (
+        PsfRenderer(sensor, (1, 1), 64, 33, "centred", diffraction=how)
+        .point_spread_functions(imaging, 0)
+        .functions[0, 0, 0]
+        for how in ("orders", "limit")
+    )
+    axis = (torch.zeros(1, dtype=torch.float64),) * 2
+    fine = DiffractionSettings(samples=800)
+    by_waves = wave_point_spread_functions(imaging, axis, 33, False, fine).functions[0, 0, 0]
+    assert float(by_orders.sum()) == pytest.approx(1.0, abs=0.01)
+    share = float(order_efficiencies(lens, [1], [wavelength])[0, 0])
+    sharp = (slice(15, 18),) * 2
+    assert float(by_orders[sharp].sum()) == pytest.approx(float(by_waves[sharp].sum()), abs=0.02)
+    # Rays' order alone has all light in one place.
+    apart, alone = (float((one - by_waves).abs().sum()) for one in (by_orders, by_one))
+    assert apart < 0.1 and alone > 1.5 * (1.0 - share)
+
+
 def test_rays_do_not_show_heights_alone():
     lens = flat_lens()
     surface = lens.surfaces["2"]
     surface.phase = None
     with pytest.raises(InputError, match="heights alone, which rays do not see"):
         RayRenderer(SENSOR, 4).render(lens, SCENE, texture(), 0)
+    rings = flat_lens(rings=[0.0, 100.0], pitch=0.1)
+    orders = PsfRenderer(SENSOR, (1, 1), 4, 33, diffraction="orders")
+    with pytest.raises(InputError, match="surface 2 has heights or cells, which have no orders"):
+        orders.render(rings, SCENE, texture(), 0)
 
 
 def test_auto_asks_waves_whether_the_order_of_rays_is_enough():

@@ -25,6 +25,7 @@ from dolens.experiments.camera.views.truth import (
     sample_texture,
 )
 from dolens.experiments.camera.views.whole import (
+    DIFFRACTION,
     Placing,
     WholePicture,
     at_depth,
@@ -66,9 +67,9 @@ class DepthViews(Imaging):
         seed: of rendering and noise.
         reference_renderers: make the test images besides, of the same sensor, by name.
         psf_diffraction: of the functions that networks ask for: `none`; `limit`: blurred by a
-            perfect pupil's diffraction, as a measurement would find them; `wave`: of wavefronts, at
-            the middle of the sensor, with the `band` of the evaluation's.  Rays do not see a
-            diffractive element's heights and other orders.
+            perfect pupil's diffraction, as a measurement would find them; `orders`: the same of all
+            orders of diffractive elements; `wave`: of wavefronts, at the middle of the sensor, with
+            the `band` of the evaluation's.  Rays do not see a diffractive element's heights.
         psf_depths: of the functions that networks ask for, mm; None: the scene's.  A camera that is
             calibrated at its own depths is judged at others by it.
         lights: are added to all images, those of tests too; None: none.
@@ -108,7 +109,7 @@ class DepthViews(Imaging):
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self._reference_renderers = dict(reference_renderers or {})
-        check_choice(psf_diffraction, ("none", "limit", "wave"), "views.psf_diffraction")
+        check_choice(psf_diffraction, DIFFRACTION, "views.psf_diffraction")
         self.psf_diffraction = psf_diffraction
         self._f_number: float | None = None
         others = {
@@ -147,6 +148,11 @@ class DepthViews(Imaging):
         if isinstance(self.renderer, PsfRenderer):
             return self.renderer.registration == self._registration
         return self.truth == "chief_rays" and not isinstance(self.renderer, AutoRenderer)
+
+    @property
+    def _band(self) -> tuple[float, ...]:
+        judge = self.evaluation_renderer
+        return judge.band if isinstance(judge, PsfRenderer) else (0.0,)
 
     @property
     def _registration(self) -> str:
@@ -203,15 +209,16 @@ class DepthViews(Imaging):
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
         scene = self._psf_scene(depths)
-        if self.psf_diffraction == "wave":
+        if self.psf_diffraction in ("orders", "wave"):
             renderer = PsfRenderer(
                 self.sensor,
                 (1, 1),
                 samples,
                 size or self.psf_size,
                 registration="centred" if self.registers_moved_images else "pinhole",
-                diffraction="wave",
-                band=getattr(self.evaluation_renderer, "band", (0.0,)),
+                diffraction=self.psf_diffraction,
+                band=self._band if self.psf_diffraction == "wave" else (0.0,),
+                jitter=False,
             )
             imaging = ImagingSystem.of(lens.system(), scene, self.sensor)
             return renderer.point_spread_functions(imaging, 0).functions[0]

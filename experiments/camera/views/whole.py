@@ -18,7 +18,7 @@ from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
-DIFFRACTION = ("none", "limit", "wave")
+DIFFRACTION = ("none", "limit", "orders", "wave")
 # A function's window grows until it loses less light than this, or is as large as that.
 _LOSS, _LARGEST = 0.002, 513
 # Strata of the pupil along each side, for the one function of a whole picture.
