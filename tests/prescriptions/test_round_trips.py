@@ -35,13 +35,14 @@ REFUSED = {
         for name, number in (("diffractive_doublet", 5), ("flat_lens", 2))
         for suffix, what in ((".zmx", "diffractive"), (".txt", "phase"), (".seq", "phase"))
     },
+    ("hybrid_phone", ".zmx"): "surface 3: a .zmx file cannot hold 'diffractive'",
     ("spectral_plate", ".zmx"): "surface 3: a .zmx file cannot hold 'diffractive'",
     ("spectral_plate", ".txt"): "surface 1: a .txt file cannot hold type 'paraxial_lens'",
     ("spectral_plate", ".seq"): "surface 1: a .seq file cannot hold type 'paraxial_lens'",
     # Plastics are no glass of a maker that these formats know.
     **{
         (name, suffix): f"surface 2: a {suffix} file cannot hold material 'PLASTIC:ZEONEX-E48R'"
-        for name in ("phone", "phone_insensitive")
+        for name in ("phone", "phone_four", "phone_insensitive", "hybrid_phone")
         for suffix in (".txt", ".seq")
     },
     **{
