@@ -9,10 +9,28 @@ from torch import Tensor
 from dolens.diffraction.element_orders import bent_to, orders_of
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.errors import InputError
+from dolens.optics.diffractive import Relief
+from dolens.optics.system import OpticalSystem
 from dolens.rendering.imaging_system import ImagingSystem
 
 # Least share of the light of an order that is traced; the rest is haze.
 _TRACED = 0.02
+
+
+def has_orders(system: OpticalSystem) -> bool:
+    """Return whether a lens has diffractive elements, each the relief of a phase alone."""
+    return bool(system.diffractive) and all(
+        _phase_alone(system, number) for number in system.diffractive
+    )
+
+
+def _phase_alone(system: OpticalSystem, number: int) -> bool:
+    surface = system.surfaces[number - 1]
+    return (
+        surface.deflection is not None
+        and isinstance(surface.relief, Relief)
+        and surface.relief.values is None
+    )
 
 
 def functions_of_orders(
@@ -45,22 +63,20 @@ def functions_of_orders(
         whole = functions.sum((-2, -1))
         lost = torch.where(light > 0.0, 1.0 - whole / light.clamp(min=1e-30), 0.0)
         return functions, light, lost.detach().amax()
-    own = []
     for number in system.diffractive:
-        surface = system.surfaces[number - 1]
-        relief, law = surface.relief, surface.deflection
-        if law is None or relief is None or relief.values is not None:
+        if not _phase_alone(system, number):
             raise InputError(
                 f"diffraction orders: surface {number} has heights or cells, which have no orders; "
                 "allowed: wave"
             )
-        own.append(round(float(law.parameters["order"])))
+    laws = (system.surfaces[number - 1].deflection for number in system.diffractive)
+    own = tuple(round(float(law.parameters["order"])) for law in laws if law is not None)
     total = torch.zeros_like(functions)
     for order in orders_of(system.double(), ObjectPoints.at(places), wavelengths):
         if float(order.share.max()) < _TRACED:
             continue
         part, whole = functions, light
-        if order.numbers != tuple(own):
+        if order.numbers != own:
             part, whole = by_rays(replace(imaging, system=bent_to(system, order.numbers)))
         share = order.share.reshape(functions.shape[:3]).to(light)
         scale = torch.where(whole > 0.0, share * light / torch.where(whole > 0.0, whole, 1.0), 0.0)

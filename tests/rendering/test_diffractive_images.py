@@ -180,7 +180,8 @@ def test_auto_asks_waves_whether_the_order_of_rays_is_enough():
         renderer = AutoRenderer(sensor, tolerance=4.0)
         renderer.prepare(flat_lens(torch.float32, **element), SCENE)
         plans[levels] = renderer.choice
-    assert plans[2].renderer.diffraction == "wave"
+    # Rays of all orders are enough, with a window for what is haze.
+    assert plans[2].renderer.diffraction == "orders" and plans[2].renderer.size > 100
     assert any("other orders than rays'" in line for line in plans[2].lines())
     # A blazed relief at its wavelength, and pixels far larger than the Airy disc.
     assert plans[None].renderer.settings().get("diffraction", "none") == "none"

@@ -23,6 +23,7 @@ from dolens.rendering.plane_points import (
     plane_points,
 )
 from dolens.rendering.psf_grid import (
+    field_point_spread_functions,
     sampled_disc,
     splat_plane_points,
     wave_cost,
@@ -90,6 +91,13 @@ class Survey:
         fast = "auto" if self.imaging.system.diffractive else "fourier"
         settings = DiffractionSettings(method=fast)
         found = wave_point_spread_functions(self.imaging, self.points, size, distortion, settings)
+        return found.functions
+
+    def orders(self, size: int, distortion: bool) -> Tensor:
+        """Functions (N, D, C, size, size) of all orders of diffractive elements, by rays."""
+        found = field_point_spread_functions(
+            self.imaging, self.points, size, SAMPLES, 0, distortion, orders=True
+        )
         return found.functions
 
     def wave_cost(self, size: int, distortion: bool) -> tuple[int, str | None]:

@@ -23,6 +23,7 @@ from dolens.rendering.auto.field_grid import (
 )
 from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.order_functions import has_orders
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
@@ -43,7 +44,7 @@ _MOST_SAMPLES = 1 << 28
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 # Models of diffraction, from the least to the most exact.
-_DIFFRACTION_MODELS = ("none", "limit", "wave")
+_DIFFRACTION_MODELS = ("none", "limit", "orders", "wave")
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,8 @@ def _diffraction(
     if against is not None:
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"
-        return Decision("diffraction", "limit", error, because), error
+        kind = "orders" if has_orders(truth.imaging.system) else "limit"
+        return Decision("diffraction", kind, error, because), error
     waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
     rays, differing = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
@@ -241,6 +243,16 @@ def _diffraction(
         because = f"{seen}; measured by waves; without it {without:.2g}"
         return Decision("diffraction", "limit", with_limit, because), without
     because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"
+    if has_orders(truth.imaging.system):
+        by_orders = with_diffraction_limit(
+            found.orders(size, distortion).double(), pitch, scene.wavelengths, truth.f_number
+        )
+        # One sample of the pupil has twice the noise of two.
+        square = float(grey_levels(by_orders - waves).square().mean()) - 2.0 * noise
+        with_orders = math.sqrt(max(square, 0.0))
+        if with_orders <= _DIFFRACTION * tolerance:
+            return Decision("diffraction", "orders", with_orders, because), without
+        because = f"{because}, with all orders {with_orders:.2g}"
     return Decision("diffraction", "wave", 0.0, because), without
 
 
@@ -254,6 +266,9 @@ def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Dec
         return with_diffraction_limit(functions, pitch, scene.wavelengths, truth.f_number)
 
     widest = renderer.size + 2 * _MARGINS[-1]
+    if truth.imaging.system.diffractive:
+        because = "haze of a diffractive element's other orders is even within it"
+        return Decision("window with diffraction", str(widest), 0.0, because)
     whole, error, size = blurred(widest), math.inf, renderer.size
     for margin in _MARGINS[:-1]:
         size = renderer.size + 2 * margin
