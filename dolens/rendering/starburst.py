@@ -21,7 +21,6 @@ from torch import Tensor
 from dolens.diffraction.edge_diffraction import diffracted_light, pupil_edge
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pixel_psf import PixelWindow, propagation, wave_kernels
-from dolens.diffraction.propagation import DiffractionSettings
 from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil, with_differentiable_bounds
 from dolens.diffraction.wavefront import MM_PER_NM, pupil_wavefront
 from dolens.errors import InputError
@@ -197,8 +196,10 @@ def _window(
     given = (points, wavelengths, centre.expand(len(wavelengths), 2))
     window = PixelWindow(sensor.pixel_pitch, size)
     try:
-        if not bool(propagation(system, *given, window).fourier.all()):
+        ways = propagation(system, *given, window).reasons
+        # Direct integration takes minutes.
+        if any(way.startswith("direct") for way in ways):
             return None
-        return wave_kernels(system, *given, window, DiffractionSettings(method="fourier")).mean(0)
+        return wave_kernels(system, *given, window).mean(0)
     except InputError:
         return None
