@@ -179,7 +179,7 @@ class SnapshotSpectraModule(Experiment):
         )
         rgb = torch.stack([crops[n][:3] for n in range(len(crops))])
         self.prior = spectral_prior(self._scenes(rgb, "train", -len(rgb)), sampling.maps)
-        fine = DiffractionSettings(method="fourier", samples=sampling.rival_samples)
+        fine = DiffractionSettings(samples=sampling.rival_samples)
         with torch.no_grad():
             lenses = {id(lens): lens for lens in self.rivals.values()}
             found = {key: self.functions(lens, fine) for key, lens in lenses.items()}
@@ -191,7 +191,7 @@ class SnapshotSpectraModule(Experiment):
         options = {"dtype": torch.float64, "device": self.relief.device}
         points = torch.tensor([[0.0, 0.0, -_FAR]], **options).expand(len(BANDS), 3)
         window = PixelWindow(sampling.pixel_pitch, sampling.psf_size)
-        settings = settings or DiffractionSettings(method="fourier")
+        settings = settings or DiffractionSettings()
         waves, middle = torch.tensor(BANDS, **options), torch.zeros(len(BANDS), 2, **options)
         return wave_kernels(lens.system(), points, waves, middle, window, settings)
 

@@ -108,10 +108,9 @@ def exchange_surface(lens):
     lens.surfaces["3"] = new
 
 
-def change_a_list_of_materials(lens):
-    lens.materials = list(lens.materials)
-    lens.trace(bundle())
-    lens.materials[1] = lens.materials[3]
+def change_the_materials(lens):
+    before, _, *behind = lens.materials
+    lens.materials = [before, lens.materials[3], *behind]
 
 
 def change_data(lens):
@@ -156,7 +155,7 @@ def change_pose(lens):
 
 
 POSED = [change_aperture, change_material, change_gap, change_pose]  # of a lens with an element
-CHANGES = [exchange_parameter, exchange_surface, change_a_list_of_materials, change_data]
+CHANGES = [exchange_parameter, exchange_surface, change_the_materials, change_data]
 CHANGES += [change_precision, rule_a_grating, drop_reversals, *POSED]
 
 
