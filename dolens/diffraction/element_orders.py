@@ -52,13 +52,22 @@ def light_goes_by_orders(system: OpticalSystem) -> bool:
     try:
         element_number(system)
     except InputError as error:
-        for number in system.diffractive:
-            surface = system.surfaces[number - 1]
-            assert surface.relief is not None
-            if surface.deflection is None or surface.relief.values is not None:
-                raise InputError(f"{error}; orders are those of a 'phase' alone") from None
+        if not has_orders(system):
+            raise InputError(f"{error}; orders are those of a 'phase' alone") from None
         return True
     return False
+
+
+def has_orders(system: OpticalSystem) -> bool:
+    """Return whether each diffractive element of a lens is the relief of a phase alone."""
+    return all(is_phase_alone(system, number) for number in system.diffractive)
+
+
+def is_phase_alone(system: OpticalSystem, number: int) -> bool:
+    """Return whether a surface has the relief of its phase, and no heights or cells."""
+    surface = system.surfaces[number - 1]
+    relief = surface.relief
+    return surface.deflection is not None and isinstance(relief, Relief) and relief.values is None
 
 
 def element_flux(

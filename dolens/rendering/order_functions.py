@@ -6,31 +6,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.diffraction.element_orders import bent_to, orders_of
+from dolens.diffraction.element_orders import bent_to, is_phase_alone, orders_of
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.errors import InputError
-from dolens.optics.diffractive import Relief
-from dolens.optics.system import OpticalSystem
 from dolens.rendering.imaging_system import ImagingSystem
 
 # Least share of the light of an order that is traced; the rest is haze.
 _TRACED = 0.02
-
-
-def has_orders(system: OpticalSystem) -> bool:
-    """Return whether a lens has diffractive elements, each the relief of a phase alone."""
-    return bool(system.diffractive) and all(
-        _phase_alone(system, number) for number in system.diffractive
-    )
-
-
-def _phase_alone(system: OpticalSystem, number: int) -> bool:
-    surface = system.surfaces[number - 1]
-    return (
-        surface.deflection is not None
-        and isinstance(surface.relief, Relief)
-        and surface.relief.values is None
-    )
 
 
 def functions_of_orders(
@@ -45,7 +27,7 @@ def functions_of_orders(
     Orders of less than 2 % of the light, and light beyond the window, are haze: even within it.
 
     Args:
-        imaging: the lens, D depths and C wavelengths.
+        imaging: the lens, with diffractive elements, D depths and C wavelengths.
         places: (N·D·C, 3), mm, object points of N functions.
         wavelengths: (N·D·C,), nm.
         by_rays: functions (N, D, C, K, K) and their whole light (N, 1, C) by the rays of a lens in
@@ -59,12 +41,8 @@ def functions_of_orders(
     """
     system = imaging.system
     functions, light = by_rays(imaging)
-    if not system.diffractive:
-        whole = functions.sum((-2, -1))
-        lost = torch.where(light > 0.0, 1.0 - whole / light.clamp(min=1e-30), 0.0)
-        return functions, light, lost.detach().amax()
     for number in system.diffractive:
-        if not _phase_alone(system, number):
+        if not is_phase_alone(system, number):
             raise InputError(
                 f"diffraction orders: surface {number} has heights or cells, which have no orders; "
                 "allowed: wave"
@@ -81,7 +59,14 @@ def functions_of_orders(
         share = order.share.reshape(functions.shape[:3]).to(light)
         scale = torch.where(whole > 0.0, share * light / torch.where(whole > 0.0, whole, 1.0), 0.0)
         total = total + part * scale[..., None, None]
-    haze = (light - total.sum((-2, -1))).clamp(min=0.0)
-    total = total + (haze / total.shape[-1] ** 2)[..., None, None]
-    lost = torch.where(light > 0.0, haze / light.clamp(min=1e-30), 0.0)
-    return total, light, lost.detach().amax()
+    total, haze = with_haze(total, light)
+    return total, light, haze.amax()
+
+
+def with_haze(functions: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Return functions (..., K, K) with what their sums lack of their light (...) as haze, even
+    within the window, and its share of the light (...), without gradient.
+    """
+    haze = (light - functions.sum((-2, -1))).clamp(min=0.0)
+    share = torch.where(light > 0.0, haze / torch.where(light > 0.0, light, 1.0), 0.0)
+    return functions + (haze / functions.shape[-1] ** 2)[..., None, None], share.detach()

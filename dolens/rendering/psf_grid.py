@@ -27,7 +27,7 @@ from dolens.optics.ray_tracing import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem, require_seen_by_rays
 from dolens.rendering.exit_pupil import working_f_number
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.order_functions import functions_of_orders
+from dolens.rendering.order_functions import functions_of_orders, with_haze
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -128,7 +128,9 @@ def field_point_spread_functions(
         about = PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight)
         return splat_plane_points(about, size, cpu_kernels_serve(system))
 
-    return _of_orders(imaging, points, centre, by_rays) if orders else by_rays(imaging)
+    if orders and system.diffractive:
+        return _of_orders(imaging, points, centre, by_rays)
+    return by_rays(imaging)
 
 
 def _of_orders(
@@ -212,9 +214,7 @@ def _wave_kernels(
         return kernels, torch.zeros_like(flat), torch.ones_like(flat)
     whole, kept = element_flux(system, ObjectPoints.at(places[0]), *places[1:])
     whole, kept = (whole * kept).to(kernels), kept.to(kernels).clamp(min=_DARK)
-    haze = (whole - kernels.sum((-2, -1))).clamp(min=0.0)
-    kernels = kernels + (haze / window.size**2)[:, None, None]
-    return kernels, torch.where(whole > 0.0, haze / whole, 0.0).detach(), kept
+    return *with_haze(kernels, whole), kept
 
 
 def wave_cost(
@@ -411,15 +411,26 @@ def place_functions(
     if diffraction != "wave":
         require_seen_by_rays(system, "point spread functions")
     disc = sampled_disc(torch.zeros(1, dtype=torch.int64), samples, 0, system)
-    seen = plane_points(imaging, points, disc)
-    down = seen.rows - ideal.rows[..., None, None].to(seen.rows)
-    across = seen.columns - ideal.columns[..., None, None].to(seen.columns)
-    a, b, c, d = (m[..., None, None].to(seen.rows) for m in ideal.inverse.flatten(-2).unbind(-1))
-    moved = PlanePoints(a * down + b * across, c * down + d * across, seen.weight)
-    found = splat_plane_points(moved, size, cpu_kernels_serve(system))
+    centre = ideal.rows[..., None], ideal.columns[..., None]
+
+    def by_rays(imaging: ImagingSystem) -> FieldPointSpreadFunctions:
+        seen = plane_points(imaging, points, disc)
+        down, across = (
+            place - c[..., None].to(place)
+            for place, c in zip((seen.rows, seen.columns), centre, strict=True)
+        )
+        inverse = ideal.inverse.flatten(-2).unbind(-1)
+        a, b, c, d = (m[..., None, None].to(seen.rows) for m in inverse)
+        moved = PlanePoints(a * down + b * across, c * down + d * across, seen.weight)
+        return splat_plane_points(moved, size, cpu_kernels_serve(system))
+
+    if diffraction == "orders" and system.diffractive:
+        found = _of_orders(imaging, points, centre, by_rays)
+    else:
+        found = by_rays(imaging)
     functions, light = found.functions, found.light
     if diffraction == "wave":
-        places = object_points(imaging, points, (ideal.rows[..., None], ideal.columns[..., None]))
+        places = object_points(imaging, points, centre)
         kernels, _, kept = _wave_kernels(system, places, PixelWindow(pitch, size))
         functions = kernels.reshape_as(functions)
         light = light * kept.reshape(functions.shape[:3]).mean(1)

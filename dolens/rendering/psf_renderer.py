@@ -237,9 +237,8 @@ class PsfRenderer(Renderer):
 
     def _warn_of_loss(self, found: FieldPointSpreadFunctions) -> None:
         if float(found.truncated) > _NOTABLE_LOSS:
-            made = (
-                "keeps it" if self.diffraction != "wave" else "says where, not evenly within them"
-            )
+            haze = self.diffraction in ("orders", "wave")
+            made = "says where, not evenly within them" if haze else "keeps it"
             say_once(
                 f"renderer psf: {100 * float(found.truncated):.0f} % of a function's light falls "
                 f"beyond its {self.size} pixels; a larger renderer.size {made}"

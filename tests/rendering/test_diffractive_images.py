@@ -1,5 +1,6 @@
 """Photographs through diffractive elements: all orders, where rays see the first."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,7 +14,11 @@ from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.cells import cell_table, cell_widths
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.psf_grid import wave_point_spread_functions
+from dolens.rendering.psf_grid import (
+    pinhole_places,
+    place_functions,
+    wave_point_spread_functions,
+)
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -159,6 +164,21 @@ def test_rays_of_every_order_make_what_waves_make(levels, wavelength):
     # Rays' order alone has all light in one place.
     apart, alone = (float((one - by_waves).abs().sum()) for one in (by_orders, by_one))
     assert apart < 0.1 and alone > 1.5 * (1.0 - share)
+
+
+def test_restorers_of_a_field_are_told_all_orders():
+    """Two levels send 4/π² = 40.5 % into rays' order, on the axis and beside it."""
+    sensor = Sensor(33, 33, 0.02)
+    imaging = ImagingSystem.of(flat_lens(levels=2).system(), SCENE, sensor)
+    points = torch.tensor([0.0, 0.1]).double(), torch.zeros(2).double()
+    ideal = pinhole_places(imaging, points)
+    sharp = (..., slice(14, 19), slice(14, 19))
+    held = {
+        how: place_functions(imaging, points, ideal, 33, how).functions[sharp].sum((-2, -1))
+        for how in ("limit", "orders")
+    }
+    assert torch.allclose(held["orders"], 4.0 / math.pi**2 * held["limit"], rtol=0.06)
+    assert float(held["limit"].min()) > 0.95
 
 
 def test_rays_do_not_show_heights_alone():

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.diffraction.element_orders import has_orders
 from dolens.diffraction.pixel_psf import diffraction_transfer, with_diffraction_limit
 from dolens.rendering.auto.field_grid import (
     REGISTRATIONS,
@@ -23,7 +24,6 @@ from dolens.rendering.auto.field_grid import (
 )
 from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.order_functions import has_orders
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
@@ -225,7 +225,7 @@ def _diffraction(
     if against is not None:
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"
-        kind = "orders" if has_orders(truth.imaging.system) else "limit"
+        kind = "orders" if element and has_orders(truth.imaging.system) else "limit"
         return Decision("diffraction", kind, error, because), error
     waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
@@ -243,7 +243,7 @@ def _diffraction(
         because = f"{seen}; measured by waves; without it {without:.2g}"
         return Decision("diffraction", "limit", with_limit, because), without
     because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"
-    if has_orders(truth.imaging.system):
+    if element and has_orders(truth.imaging.system):
         by_orders = with_diffraction_limit(
             found.orders(size, distortion).double(), pitch, scene.wavelengths, truth.f_number
         )
