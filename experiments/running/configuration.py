@@ -28,6 +28,7 @@ from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.trust import needing_trust, refuse_untrusted
 from dolens.experiments.settings import register_resolvers
 from dolens.files import packaged_configuration
+from dolens.prescriptions.cells import with_tables
 
 # What Hydra makes; the lens is made by `dolens.prescriptions`, from data alone.
 _MADE = ("module", "data", "callbacks", "logger", "trainer")
@@ -36,20 +37,25 @@ _MADE = ("module", "data", "callbacks", "logger", "trainer")
 def checked(cfg: DictConfig) -> DictConfig:
     """Return the configuration that a run works with.
 
-    It is the composed one without Hydra's own part, and without the entries that an experiment
-    drops.
+    It is the composed one without Hydra's own part, without the entries that an experiment drops,
+    and with the tables of cells that its lens names as files.
 
     Args:
         cfg: as Hydra gives it to the job; it stays as it is.
 
     Raises:
-        InputError: an old name, an entry dropped that no parent has, a `_target_` in a lens, a key
-            that a class does not take, a setting that is missing, a value of another type than the
-            class takes, or a setting that nothing reads.
+        InputError: an old name, an entry dropped that no parent has, a table that cannot be read, a
+            `_target_` in a lens, a key that a class does not take, a setting that is missing, a
+            value of another type than the class takes, or a setting that nothing reads.
     """
     own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     own = without_dropped(own)
     plain = OmegaConf.to_container(own, resolve=False)
+    assert isinstance(plain, dict)  # as a composed configuration is
+    if (lens := with_tables(plain.get("lens"))) is not plain.get("lens"):
+        # A run folder holds all that its lens is made of.
+        OmegaConf.update(own, "lens", lens, merge=False)
+        plain["lens"] = lens
     refuse_targets_in_lenses(plain)
     refuse_unknown_keys(plain, _MADE)
     refuse_missing(plain, _MADE)

@@ -34,7 +34,6 @@ from dolens.experiments.running.user_configuration import import_extensions
 from dolens.experiments.settings import register_resolvers
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
-from dolens.prescriptions.cells import with_tables
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,7 @@ def _loaded(
 
 def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
     lens = lens_from_prescription(
-        with_tables(prescription), settings.dtype, where="lens", backend=settings.backend
+        prescription, settings.dtype, where="lens", backend=settings.backend
     )
     return lens.in_state(settings.state)
 

@@ -55,6 +55,16 @@ def test_the_parent_s_variables_are_replaced_as_a_whole(inherited):
     assert list(cfg.module.variables) == ["surfaces.1.curvature", "sensor_distance"]
 
 
+def test_a_run_records_the_table_of_cells_that_its_lens_names(composed, tmp_path):
+    file = tmp_path / "pillars.csv"
+    file.write_text("width_nm wavelength_nm phase_rad power\n80 540 0.1 0.9\n120 540 0.7 0.8\n")
+    element = f"+lens.surfaces.2.diffractive.cells={file}"
+    cfg = checked(composed("experiment=diffractive_achromat", element))
+    file.unlink()
+    rows = cfg.lens.surfaces["2"].diffractive.cells
+    assert [list(row)[:3] for row in rows[1:]] == [[80.0, 540.0, 0.1], [120.0, 540.0, 0.7]]
+
+
 def test_the_command_line_drops_and_replaces_too(composed):
     cfg = checked(composed("experiment=asphere", "variables={surfaces.1.conic: drop}"))
     assert list(cfg.variables) == ["surfaces.1.curvature", "surfaces.1.a4"]
