@@ -1,11 +1,17 @@
 """Tensors that a process keeps serve every later call, with and without gradients."""
 
+import hashlib
+import io
+import pickle
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from functools import lru_cache, wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
 P = ParamSpec("P")
@@ -40,5 +46,58 @@ def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Cal
                 return function(*args, **options)
 
         return kept  # type: ignore[return-value]  # a wrapper takes what the function takes
+
+    return decorate
+
+
+class _Contents(pickle.Pickler):
+    """Writes what tensors and dataclasses hold, and nothing of where or what else they keep."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        """Return what is written of a thing, as `pickle` asks for it."""
+        if isinstance(thing, Tensor):
+            numbers = thing.detach().cpu().contiguous().numpy().tobytes()
+            return tuple, ((str(thing.dtype), str(thing.device), tuple(thing.shape), numbers),)
+        if is_dataclass(thing) and not isinstance(thing, type):
+            return type(thing), tuple(getattr(thing, field.name) for field in fields(thing))
+        return NotImplemented
+
+
+def _digest(*things: Any) -> bytes:
+    written = io.BytesIO()
+    _Contents(written).dump(things)
+    return hashlib.blake2b(written.getbuffer()).digest()
+
+
+def kept_by_content(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator for functions of tensors whose results serve later calls with equal ones.
+
+    Arguments are compared bit by bit, by a digest of what they hold: a lens that is built anew
+    from the same numbers is the same.  With gradients, or within a transform of
+    `torch.func`, nothing is kept.  Callers must not change what is returned.
+
+    Args:
+        maxsize: how many results are kept, those that were asked for last.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        results: OrderedDict[bytes, R] = OrderedDict()
+
+        @wraps(function)
+        def kept(*args: P.args, **options: P.kwargs) -> R:
+            if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
+                return function(*args, **options)
+            key = _digest(args, options)
+            found = results.get(key)
+            if found is None:
+                with to_be_kept():
+                    found = results[key] = function(*args, **options)
+            else:
+                results.move_to_end(key)
+            while len(results) > maxsize:
+                results.popitem(last=False)
+            return found
+
+        return kept
 
     return decorate

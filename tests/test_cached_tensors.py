@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from dolens import Rays
-from dolens.cached_tensors import cached_tensors
+from dolens import Rays, load_lens
+from dolens.cached_tensors import cached_tensors, kept_by_content
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering import chief_ray_map
 
@@ -54,3 +54,46 @@ def test_a_tensor_first_made_within_a_transform_is_no_part_of_it():
     made = cached_tensors()(lambda count: torch.ones(count).to(torch.float64))
     torch.func.grad(lambda x: (x * made(3)).sum())(torch.ones(3, dtype=torch.float64))
     assert not torch._C._functorch.is_functorch_wrapped_tensor(made(3))
+
+
+def test_results_serve_calls_with_equal_numbers_and_no_others():
+    """Of a lens that is built anew, of a wavelength as a number, and of the order of two calls."""
+    made = []
+
+    @kept_by_content(maxsize=2)
+    def doubled(system, wavelength):
+        made.append(wavelength)
+        return 2.0 * system.surfaces[0].parameters["curvature"]
+
+    lens = load_lens("la1509")
+
+    def seen(wavelength=550.0, **values):
+        given = {f"surfaces.1.{name}": value for name, value in values.items()}
+        return float(doubled(lens.with_values(given).system(), wavelength))
+
+    with torch.no_grad():
+        assert seen(curvature=0.01) == seen(curvature=0.01) == pytest.approx(0.02)
+        assert seen(curvature=0.03) == pytest.approx(0.06) and len(made) == 2
+        seen(curvature=0.01, wavelength=600.0)
+        assert len(made) == 3
+        seen(curvature=0.03)
+        assert len(made) == 3
+        seen(curvature=0.01)  # two were asked for since
+        assert len(made) == 4
+    curvature = torch.tensor(0.01, requires_grad=True)
+    for _ in range(2):
+        doubled(lens.with_values({"surfaces.1.curvature": curvature}).system(), 550.0).backward()
+    assert float(curvature.grad) == 4.0 and len(made) == 6
+    torch.func.grad(lambda c: doubled(lens.system({"surfaces.1.curvature": c}), 550.0))(curvature)
+    assert len(made) == 7
+
+
+def test_what_was_kept_in_inference_serves_training():
+    kept = kept_by_content(maxsize=1)(lambda count: torch.ones(count))
+    with torch.inference_mode():
+        kept(3)
+    weight = torch.tensor(1.0, requires_grad=True)
+    with torch.no_grad():
+        ones = kept(3)
+    (weight * ones).sum().backward()
+    assert float(weight.grad) == 3.0

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import kept_by_content
 from dolens.diffraction.element_orders import element_flux
 from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.pixel_psf import (
@@ -166,6 +167,7 @@ def splat_plane_points(seen: PlanePoints, size: int, fused: bool) -> FieldPointS
     return FieldPointSpreadFunctions(functions, total[:, 0], lost)
 
 
+@kept_by_content(maxsize=4)
 def wave_point_spread_functions(
     imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
@@ -181,6 +183,9 @@ def wave_point_spread_functions(
     even within the window.  Arguments as of `field_point_spread_functions`, how finely diffraction
     is computed, and nm from each of the scene's wavelengths, whose light a function has in equal
     parts.
+
+    Without gradients, functions of the same lens and points are computed once: a test asks for them
+    with every photograph.
     """
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     at, waves, centres = object_points(imaging, points, _centres(imaging, points, distortion))
