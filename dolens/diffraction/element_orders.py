@@ -67,7 +67,7 @@ def is_phase_alone(system: OpticalSystem, number: int) -> bool:
     """Return whether a surface has the relief of its phase, and no heights or cells."""
     surface = system.surfaces[number - 1]
     relief = surface.relief
-    return surface.deflection is not None and isinstance(relief, Relief) and relief.values is None
+    return surface.deflection is not None and isinstance(relief, Relief) and not relief.values
 
 
 def element_flux(

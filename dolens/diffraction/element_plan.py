@@ -91,7 +91,7 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     cells = _TWO * settings.oversampling
     finest = min(wave / (cells * max(steepest, 1e-12)), width / (settings.samples or _FEWEST))
     cell = finest
-    if relief.values is not None:
+    if relief.values:
         # Of finer rings than a wavelength light sees the mean.
         rings = max(relief.pitch / cells, min(relief.pitch, 0.5 * wave))
         own = relief.pitch if relief.pixelated else rings
@@ -105,9 +105,9 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     starts = []
     for axis in (0, 1):
         half = 0.0
-        if relief.values is not None and relief.pixelated:
+        if relief.pixelated:
             # Edges of pixels fall on edges of cells.
-            half = 0.5 * relief.pitch * relief.values.shape[1 - axis]
+            half = 0.5 * relief.pitch * relief.values[0].shape[1 - axis]
         middle = 0.5 * float(low[axis] + high[axis])
         starts.append(round((middle + half) / cell - 0.5 * count) * cell - half)
     reach = width + 2.0 * half_window

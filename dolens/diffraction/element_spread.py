@@ -97,8 +97,7 @@ class ElementSpread:
         def added(x: Tensor, y: Tensor) -> Tensor:
             total = torch.zeros(len(y), len(x), dtype=torch.float64)
             for n, plan in enumerate(plans):
-                field = light.field(n, plan, x, y, torch.float32).cpu()
-                total += float(share[n]) * (field.real.double() ** 2 + field.imag.double() ** 2)
+                total += float(share[n]) * light.irradiance(n, plan, x, y, torch.float32).cpu()
             return total
 
         whole = added(grid, grid)

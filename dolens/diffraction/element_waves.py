@@ -11,7 +11,7 @@ the amplitude sinc(Δ·pitch/λ) along each axis, which is taken towards the mid
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -93,7 +93,7 @@ class ElementLight:
         found = [self.fit.coefficients, *self.thicknesses]
         found += [s.edge for s in clipping if s.edge is not None]
         found += [] if self.law is None else self.law.parameters.values()
-        return found + ([] if self.relief.values is None else [self.relief.values])
+        return found + list(self.relief.values)
 
     def with_tensors(self, values: Sequence[Tensor]) -> "ElementLight":
         """Return the same light with other tensors."""
@@ -107,7 +107,7 @@ class ElementLight:
         law = self.law
         if law is not None:
             law = replace(law, parameters={name: left.pop(0) for name in law.parameters})
-        relief = self.relief.with_values(left.pop(0)) if left else self.relief
+        relief = self.relief.with_values(left)
         fit = replace(
             self.fit,
             coefficients=coefficients,
@@ -138,7 +138,7 @@ class ElementLight:
         x, y = (at - c for at, c in zip(pupil.cosines[0], self.centre[n], strict=True))
         gain = far / (x.square()[None] + y.square()[:, None] + far * far)
         wave = MM_PER_NM * float(self.fit.wavefront.wavelength[n])
-        amplitude = pupil.amplitude[0] * self._passed_by_cells(n, pupil)
+        amplitude = pupil.amplitude[0] * self._passed_by_cells(n, pupil).sqrt()
         return float(((amplitude * gain).sum() * plan.cell**2 / wave).square())
 
     def passed_share(self, n: int, plan: Plan) -> Tensor:
@@ -147,16 +147,29 @@ class ElementLight:
             return torch.ones((), dtype=torch.float64)
         pupil = self.pupil(n, plan, (0.0, 0.0), torch.float64)
         flux = pupil.amplitude[0].square()
-        passed = (flux * self._passed_by_cells(n, pupil).square()).sum()
+        passed = (flux * self._passed_by_cells(n, pupil)).sum()
         return passed / flux.sum().clamp(min=1e-30)
 
+    @cached_property
+    def parts(self) -> list[tuple[float, "ElementLight"]]:
+        """Return fields whose irradiances add up, each with its weight: polarised cells have
+        several, and all else has one.
+        """
+        if isinstance(self.relief, Relief):
+            return [(1.0, self)]
+        found = self.relief.parts
+        return [(weight, replace(self, relief=relief)) for weight, relief in found]
+
     def _passed_by_cells(self, n: int, pupil: RegularPupil) -> Tensor:
-        """Return the magnitude of what cells pass on a pupil's grid; 1 of a relief."""
+        """Return the share of the power that cells pass on a pupil's grid; 1 of a relief."""
         if isinstance(self.relief, Relief):
             return torch.ones((), dtype=torch.float64)
         x, y = pupil.cosines[0]
         wavelength = float(self.fit.wavefront.wavelength[n])
-        return self.relief.transmission(x, y, wavelength).abs()
+        power = torch.zeros((), dtype=torch.float64)
+        for weight, part in self.relief.parts:
+            power = power + weight * part.transmission(x, y, wavelength).abs().square()
+        return power
 
     def field(self, n: int, plan: Plan, u: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the field (V, U) of a point in its window; |U|² is flux per mm².
@@ -177,6 +190,11 @@ class ElementLight:
         rows, columns = torch.meshgrid(v + centre[1], u + centre[0], indexing="ij")
         return by_summation(found, layers[0], columns.flatten(), rows.flatten()).reshape(rows.shape)
 
+    def irradiance(self, n: int, plan: Plan, u: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the flux per mm² (V, U) of a point in its window; arguments as of `field`."""
+        parts = ((weight, part.field(n, plan, u, v, dtype)) for weight, part in self.parts)
+        return _added(parts)
+
     def one_radius(self, n: int, half_window: float) -> bool:
         """Return whether `radial` serves a window about the axis.
 
@@ -194,7 +212,8 @@ class ElementLight:
         return beyond(edge, reach, behind[0], wavelength) <= MOST_BEYOND
 
     def radial(self, n: int, plan: Plan, rho: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return the field (P,) of a point on the axis at distances from it, mm; see `one_radius`.
+        """Return the flux per mm² (P,) of a point on the axis at distances from it; see
+        `one_radius`.
 
         Args:
             n: number of the point.
@@ -216,8 +235,11 @@ class ElementLight:
         for surface, u, v in zip(clipping, crossings[::2], crossings[1::2], strict=True):
             passed = torch.minimum(passed, coverage(surface.aperture, u, v, surface.edge))
         amplitude, turns = (f[1:2] for f in (whole * passed, opd / (MM_PER_NM * wavelength)))
-        values = self._passed(n, r, rows[1:2], turns, dtype) * amplitude.to(dtype)
-        return by_radius(values[0], r, layer, wavelength, rho)
+        fields = []
+        for weight, part in self.parts:
+            (values,) = part._passed(n, r, rows[1:2], turns, dtype) * amplitude.to(dtype)
+            fields.append((weight, by_radius(values, r, layer, wavelength, rho)))
+        return _added(fields)
 
     def behind(self, n: int, plan: Plan, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
@@ -310,6 +332,14 @@ class ElementLight:
             ),
             plan.count,
         )
+
+
+def _added(fields: Iterable[tuple[float, Tensor]]) -> Tensor:
+    """Return the irradiance of fields, each with its weight."""
+    return sum(
+        (weight * (field.real.square() + field.imag.square()) for weight, field in fields),
+        start=torch.zeros(()),
+    )
 
 
 def element_light(

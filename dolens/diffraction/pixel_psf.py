@@ -262,15 +262,14 @@ def _by_element(
             step = 1.0 / (_RADIAL_STEPS * plan.band)
             rho = torch.arange(math.ceil(math.sqrt(2.0) * half / step) + 3).to(x) * step
             place = torch.hypot(x[None], y[:, None]) / step
-            field = light_now.radial(i, plan, rho, dtype)
-            along = field.real.square() + field.imag.square()
+            along = light_now.radial(i, plan, rho, dtype)
             # A parabola through the three nearest.
             near = place.round().clamp(min=1.0)
             at, off = near.long(), (place - near).to(along)
             before, there, after = (along[at + k] for k in (-1, 0, 1))
             bend = 0.5 * off * off * (after - 2.0 * there + before)
             return pixels.collected(there + 0.5 * off * (after - before) + bend)[..., None]
-        return pixels.integrated(light_now.field(i, plan, x, y, dtype))[..., None]
+        return pixels.collected(light_now.irradiance(i, plan, x, y, dtype))[..., None]
 
     return replay(kernel, [1] * len(plans), light.tensors).movedim(-1, 0)
 

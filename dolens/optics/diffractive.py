@@ -83,13 +83,13 @@ class Relief:
     etch_errors: tuple[float, ...] = ()
 
     @property
-    def values(self) -> Tensor | None:
-        """Return the heights, which may be varied."""
-        return self.heights
+    def values(self) -> tuple[Tensor, ...]:
+        """Return the heights, which may be varied, if there are any."""
+        return () if self.heights is None else (self.heights,)
 
-    def with_values(self, values: Tensor) -> "Relief":
-        """Return the same relief with other heights."""
-        return replace(self, heights=values)
+    def with_values(self, values: Sequence[Tensor]) -> "Relief":
+        """Return the same relief with other `values`."""
+        return replace(self, heights=values[0]) if values else self
 
     @property
     def pixelated(self) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError, check_keys
+from dolens.errors import InputError, check_keys, comma_hint
 
 _COMPLEX = torch.complex128
 # tr(σ·JJ†) for S₀ to S₃.
@@ -87,7 +87,7 @@ def ideal_elements(given: Sequence[Mapping[str, Any]], where: str) -> Tensor:
 
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: must be a number, not {value!r}")
+        raise InputError(f"{where}: must be a number, not {value!r}{comma_hint(value)}")
     return float(value)
 
 

@@ -10,10 +10,15 @@ Between the nodes of a table u = t·exp(-iψ) is a cubic spline in width and in 
 polynomial whose differences between neighbouring nodes are those of φ, by least squares with
 weights |t|, each known but for whole turns.  So u hardly turns where the table is smooth, no phase
 is unwrapped, and a zero of t, about which φ has no unwrapped form, is a zero of u.
+
+A pillar that is no square delays light along its own x and y apart, by t_x and t_y.  Turned by θ
+from x towards y its Jones matrix is R(θ)·diag(t_x, t_y)·R(-θ), so that a half-wave cell gives
+circular light the phase ±2θ (Pancharatnam and Berry).  What each polarisation of unpolarised light
+makes in each polarisation behind is a field of its own, and their irradiances add up.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -24,6 +29,7 @@ from numpy.polynomial import chebyshev
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.jones import ideal_elements
 from dolens.optics.pixels_and_rings import on_pixels, on_rings
 from dolens.optics.splines import spline_slopes
 
@@ -32,6 +38,8 @@ _DEGREE = 3
 # What a limit of a table may be passed by, of itself, as numbers in single precision do; and what
 # of it optimizers take.
 _ROUNDING, _TAKEN = 1e-6, 5e-7
+# What of a field is rounding.
+_NOTHING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +51,8 @@ class CellTable:
         wavelengths: (L,), nm, rising; of one alone the table holds nowhere else.
         phase: (L, W), φ, radians, of light behind a cell over that in front of it.
         amplitude: (L, W), a: the root of the share of the power that passes.
+        along_y: the same of light polarised along the cell's own y, where the others are of light
+            along its x; None: they are of both.
 
     Raises:
         InputError: numbers that make no table.
@@ -52,6 +62,7 @@ class CellTable:
     wavelengths: np.ndarray
     phase: np.ndarray
     amplitude: np.ndarray
+    along_y: "CellTable | None" = None
 
     def __post_init__(self) -> None:
         for name in ("widths", "wavelengths", "phase", "amplitude"):
@@ -148,7 +159,7 @@ class CellTable:
             left = [np.delete(v, out, axis) for v in (self.phase, self.amplitude)]
             widths = np.delete(self.widths, out) if axis else self.widths
             waves = self.wavelengths if axis else np.delete(self.wavelengths, out)
-            coarse = CellTable(widths, waves, *left)
+            coarse = CellTable(widths, waves, left[0], left[1])
             exact = torch.from_numpy(self.amplitude * np.exp(1j * self.phase))
             every = torch.from_numpy(self.widths)
             worst = max(
@@ -156,6 +167,8 @@ class CellTable:
                 for wave, t in zip(self.wavelengths, exact, strict=True)
             )
             found.append(worst)
+        if self.along_y is not None:
+            found = np.maximum(found, self.along_y.held_out_errors()).tolist()
         return found[0], found[1]
 
 
@@ -196,23 +209,60 @@ class Cells:
         widths: nm, of a square grid of cells (rows along y, columns along x, both rising), or of
             rings (K,) of cells from the vertex outwards.
         pitch: mm, of cells or rings.
+        angles: degrees, of each cell's own x from x towards y; None: none is turned.
+        front: ideal polarisers and retarders close in front of the cells, in the order of the
+            light, as `dolens.optics.jones.ideal_elements` takes them.
+        behind: likewise those close behind them.
+        shares: what is looked at: of t_xx, t_xy and t_yy; None: t, where the table has one.
     """
 
     table: CellTable
     widths: Tensor
     pitch: float
+    angles: Tensor | None = None
+    front: Sequence[Mapping[str, Any]] = ()
+    behind: Sequence[Mapping[str, Any]] = ()
+    shares: tuple[complex, complex, complex] | None = None
 
     # The share of a cell's side that passes light.
     fill: ClassVar[float] = 1.0
 
     @property
-    def values(self) -> Tensor:
-        """Return the widths, which may be varied."""
-        return self.widths
+    def values(self) -> tuple[Tensor, ...]:
+        """Return the widths, and the angles if there are any: they may be varied."""
+        return (self.widths,) if self.angles is None else (self.widths, self.angles)
 
-    def with_values(self, values: Tensor) -> "Cells":
-        """Return the same cells with other widths."""
-        return replace(self, widths=values)
+    def with_values(self, values: Sequence[Tensor]) -> "Cells":
+        """Return the same cells with other `values`."""
+        return replace(self, widths=values[0], angles=values[1] if len(values) > 1 else None)
+
+    @property
+    def parts(self) -> list[tuple[float, "Cells"]]:
+        """Return what makes the irradiance of unpolarised light, each with its weight: light that
+        is polarised in two ways across each other in front, as seen in two behind.
+        """
+        if self.shares is not None or not self.polarised:
+            return [(1.0, self)]
+        arriving = seen = torch.eye(2, dtype=torch.complex128)
+        if self.front:  # rows: two fields in front of the cells
+            way, gain, _ = torch.linalg.svd(ideal_elements(self.front, "'front'"))
+            arriving = (way * gain).mT
+        if self.behind:  # rows: two fields that are looked for behind them
+            _, gain, way = torch.linalg.svd(ideal_elements(self.behind, "'behind'"))
+            seen = gain[:, None] * way
+        found: dict[tuple[complex, complex, complex], float] = {}
+        for f_x, f_y in arriving.tolist():
+            for g_x, g_y in seen.tolist():
+                shares = g_x * f_x, g_x * f_y + g_y * f_x, g_y * f_y
+                looked_at = shares if self.angles is not None else (shares[0], 0.0, shares[2])
+                if max(map(abs, looked_at)) > _NOTHING:
+                    found[looked_at] = found.get(looked_at, 0.0) + 0.5
+        return [(weight, replace(self, shares=shares)) for shares, weight in found.items()]
+
+    @property
+    def polarised(self) -> bool:
+        """Return whether the table tells light along x from light along y."""
+        return self.table.along_y is not None
 
     @property
     def pixelated(self) -> bool:
@@ -257,16 +307,33 @@ class Cells:
             wavelength: nm.
             dtype: of the sums.
         """
-        passed = self.table.transmission(self.widths.to(dtype), wavelength)
+        passed = self._of_cells(wavelength, dtype)
         if self.pixelated:
             return on_pixels(passed, self.pitch, x, y)
         step = float((x[-1] - x[0]) / max(1, len(x) - 1))
         inner, share, outer = on_rings(passed, self.pitch, x, y, step)
         return inner + share.to(dtype) * (outer - inner)
 
+    def _of_cells(self, wavelength: float, dtype: torch.dtype) -> Tensor:
+        """Return the complex amplitudes that cells pass, of the shape of `widths`."""
+        widths = self.widths.to(dtype)
+        found = self.table.transmission(widths, wavelength)
+        if self.shares is None or self.table.along_y is None:
+            return found
+        other = self.table.along_y.transmission(widths, wavelength)
+        xx, xy, yy = self.shares
+        if self.angles is None:
+            return xx * found + yy * other
+        # t_xx and t_yy are mean ± difference·cos 2θ, and t_xy is difference·sin 2θ.
+        mean, difference = 0.5 * (found + other), 0.5 * (found - other)
+        twice = self.angles.to(dtype) * (math.pi / 90.0)
+        turned = (xx - yy) * twice.cos() + xy * twice.sin()
+        return (xx + yy) * mean + turned * difference
+
 
 class Metasurface(nn.Module):
-    """The cells of a surface; its parameter is `widths` (nm), within the limits of the table.
+    """The cells of a surface; its parameters are `widths` (nm), within the limits of the table, and
+    `angles` (degrees) where cells are turned.
 
     Args:
         cells: what they are.
@@ -282,12 +349,39 @@ class Metasurface(nn.Module):
             raise InputError("'widths' must be rows of numbers, of cells, or a list, of rings; nm")
         if not 0.0 < cells.pitch < math.inf:
             raise InputError("'pitch' must be given and positive: mm, of cells or rings")
-        self.table, self.pitch = cells.table, cells.pitch
+        if cells.angles is not None and cells.angles.shape != cells.widths.shape:
+            raise InputError("'angles' must be as many as 'widths', degrees")
+        if (cells.angles is not None or cells.front or cells.behind) and not cells.polarised:
+            raise InputError(
+                "'angles', 'front' and 'behind' need a table with the phase and power of light "
+                "along each cell's own y"
+            )
+        if not cells.parts:
+            raise InputError("'front', cells and 'behind' together pass no light")
+        self._cells = replace(cells, widths=torch.zeros(0), angles=None)
         self.widths = nn.Parameter(cells.widths.detach().to(dtype, copy=True))
+        angles = cells.angles
+        self.angles = None if angles is None else nn.Parameter(angles.detach().to(dtype, copy=True))
 
     def state(self, parameters: dict[str, Tensor]) -> Cells:
         """Return the cells as the pure functions see them, with these parameters."""
-        return Cells(self.table, parameters["widths"], self.pitch)
+        given = parameters["widths"], parameters.get("angles")
+        return replace(self._cells, widths=given[0], angles=given[1])
+
+    @property
+    def cells(self) -> Cells:
+        """Return the cells with the parameters that are stored."""
+        return self.state(dict(self.named_parameters()))
+
+    @property
+    def table(self) -> CellTable:
+        """Return what cells pass."""
+        return self._cells.table
+
+    @property
+    def pitch(self) -> float:
+        """Return the pitch of cells or rings, mm."""
+        return self._cells.pitch
 
     @property
     def limits(self) -> tuple[float, float]:

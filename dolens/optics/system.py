@@ -512,8 +512,8 @@ def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:
                 tensors += surface.deflection.parameters.values()
             if surface.coating is not None:
                 tensors += surface.coating.tensors
-            if surface.relief is not None and surface.relief.values is not None:
-                tensors.append(surface.relief.values)
+            if surface.relief is not None:
+                tensors += surface.relief.values
     for element in system.elements:
         tensors += element.parameters.values()
     for profile in system.profiles.values():
@@ -593,6 +593,6 @@ def require_no_metasurface(system: OpticalSystem, what: str) -> None:
     """Raise `InputError` where a lens has cells of a metasurface; arguments as above."""
     for number in system.metasurfaces:
         raise InputError(
-            f"{what}: surface {number} has cells, whose table is one transmission for all "
-            "polarisations"
+            f"{what}: surface {number} has cells, whose light goes as waves; polarisers and "
+            "retarders about them are their keys 'front' and 'behind'"
         )

@@ -9,15 +9,17 @@ any order::
     ...
 
 `phase_cycles` may take the place of `phase_rad`, and `amplitude`, the root of the share of power
-that passes, that of `power`.  As a file it is such text (.csv, .txt; commas, semicolons, tabs or
-blanks between numbers; `#` begins a remark), or a list of rows in YAML, as in a prescription.  A
-lens file may name such a file, which is looked for beside it; a prescription names none, so that
-one from a stranger reads nothing.
+that passes, that of `power`.  `phase_y_rad` and `power_y` besides are of light polarised along a
+cell's own y; the others are then of light along its x.  As a file it is such text (.csv, .txt;
+commas, semicolons, tabs or blanks between numbers; `#` begins a remark), or a list of rows in YAML,
+as in a prescription.  A lens file may name such a file, which is looked for beside it; a
+prescription names none, so that one from a stranger reads nothing.
 """
 
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_keys
 from dolens.files import decode_text, read_file
+from dolens.optics.jones import ideal_elements
 from dolens.optics.metasurface import Cells, CellTable, Metasurface
 from dolens.optics.surfaces.base import Surface, tensor_of
 from dolens.optics.surfaces.phase import Phase
@@ -35,14 +38,18 @@ from dolens.prescriptions.plain_values import plain_values
 from dolens.prescriptions.row_data import phase_from
 
 TABLE_KEY = "cells"
-CELL_KEYS = (TABLE_KEY, "pitch", "widths", "design_wavelength")
+_BESIDE = ("front", "behind")
+CELL_KEYS = (TABLE_KEY, "pitch", "widths", "design_wavelength", "angles", *_BESIDE)
 _COLUMNS = (
     ("width_nm",),
     ("wavelength_nm",),
     ("phase_rad", "phase_cycles"),
     ("power", "amplitude"),
 )
+# Of light polarised along the cell's own y, where the others are of light along its x.
+_ALONG_Y = (("phase_y_rad", "phase_y_cycles"), ("power_y", "amplitude_y"))
 _ALLOWED = "; ".join(" or ".join(names) for names in _COLUMNS)
+_ALLOWED += f"; and by choice {' and '.join(' or '.join(names) for names in _ALONG_Y)}"
 _YAML, _TEXT = (".yaml", ".yml"), (".csv", ".txt")
 _MOST_BYTES, _MOST_ROWS = 64 * 2**20, 200_000
 # A solver's share of power may exceed one by so much.
@@ -90,32 +97,45 @@ def cell_table(rows: object, place: str = "cells") -> CellTable:
     if not 1 < len(rows) <= _MOST_ROWS:
         raise InputError(f"{place}: has {len(rows)} rows; allowed: 2 to {_MOST_ROWS}")
     names = [str(name) for name in rows[0]]
-    chosen = [[name for name in names if name in either] for either in _COLUMNS]
-    if len(names) != len(_COLUMNS) or any(len(found) != 1 for found in chosen):
+    columns = _COLUMNS if len(names) <= len(_COLUMNS) else (*_COLUMNS, *_ALONG_Y)
+    chosen = [[name for name in names if name in either] for either in columns]
+    if len(names) != len(columns) or any(len(found) != 1 for found in chosen):
         raise InputError(f"{place}: has the columns {', '.join(names)}; allowed: {_ALLOWED}")
     order = [names.index(found[0]) for found in chosen]
-    table: dict[tuple[float, float], tuple[float, float]] = {}
+    phases, powers = ([found[0] for found in chosen[k::2]] for k in (2, 3))
+    table: dict[tuple[float, float], list[tuple[float, float]]] = {}
     for number, row in enumerate(rows[1:], 1):
         where = f"{place}: row {number}"
         if len(row) != len(names):
             raise InputError(f"{where}: has {len(row)} numbers, not {len(names)}")
-        width, wave, phase, passed = (_number(row[k], f"{where}: {names[k]}") for k in order)
+        width, wave, *numbers = (_number(row[k], f"{where}: {names[k]}") for k in order)
         if not width > 0.0 or not wave > 0.0:
             raise InputError(f"{where}: {width:g} nm at {wave:g} nm; allowed: above 0")
-        if not 0.0 <= passed <= 1.0 + _ABOVE_ONE:
-            raise InputError(f"{where}: {chosen[3][0]} is {passed:g}; allowed: 0 to 1")
+        for name, passed in zip(powers, numbers[1::2], strict=True):
+            if not 0.0 <= passed <= 1.0 + _ABOVE_ONE:
+                raise InputError(f"{where}: {name} is {passed:g}; allowed: 0 to 1")
         if (wave, width) in table:
             raise InputError(f"{where}: the width {width:g} nm at {wave:g} nm is given twice")
-        turn = 2.0 * math.pi if chosen[2] == ["phase_cycles"] else 1.0
-        table[wave, width] = turn * phase, passed if chosen[3] == ["amplitude"] else passed**0.5
+        table[wave, width] = [
+            (
+                phase * (2.0 * math.pi if of_phase.endswith("cycles") else 1.0),
+                passed if of_power.startswith("amplitude") else passed**0.5,
+            )
+            for of_phase, of_power, phase, passed in zip(
+                phases, powers, numbers[::2], numbers[1::2], strict=True
+            )
+        ]
     waves, widths = (sorted({key[k] for key in table}) for k in (0, 1))
     for wave in waves:
         for width in widths:
             if (wave, width) not in table:
                 raise InputError(f"{place}: the width {width:g} nm at {wave:g} nm is missing")
-    numbers = np.array([[table[wave, width] for width in widths] for wave in waves])
+    held = np.array([[table[wave, width] for width in widths] for wave in waves])
+    nodes = np.array(widths), np.array(waves)
     try:
-        return CellTable(np.array(widths), np.array(waves), numbers[..., 0], numbers[..., 1])
+        # Of light along x first, and along y where the table has it.
+        tables = [CellTable(*nodes, *held[:, :, k].transpose(2, 0, 1)) for k in range(len(phases))]
+        return replace(tables[0], along_y=tables[1]) if len(tables) > 1 else tables[0]
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
 
@@ -157,7 +177,13 @@ def metasurface_from(
         law, nm = copy.deepcopy(surface.phase).double(), as_number(wave, "'design_wavelength'")
         sizes = as_positive(pitch, "'pitch'"), surface.semi_diameter
         widths = _widths_of(law, table, nm, *sizes).to(dtype)
-    cells = Cells(table, widths, as_number(pitch, "'pitch'"))
+    angles = row.get("angles")
+    if angles is not None:
+        angles = tensor_of(as_numbers(angles, "'angles'"), "angles", dtype)
+    beside: dict[str, Any] = {key: row.get(key) or () for key in _BESIDE}
+    for key, elements in beside.items():
+        ideal_elements(elements, f"'{key}'")
+    cells = Cells(table, widths, as_number(pitch, "'pitch'"), angles, **beside)
     found = Metasurface(cells, dtype)
     cells.check([], where)
     return found
@@ -165,11 +191,16 @@ def metasurface_from(
 
 def metasurface_row(element: Metasurface) -> dict[str, Any]:
     """Return what `metasurface_from` reads back as the same cells, to the last bit."""
-    return {
-        TABLE_KEY: cell_rows(element.table),
-        "pitch": element.pitch,
-        "widths": element.widths.detach().tolist(),
+    cells = element.cells
+    row = {
+        TABLE_KEY: cell_rows(cells.table),
+        "pitch": cells.pitch,
+        "widths": cells.widths.detach().tolist(),
     }
+    if cells.angles is not None:
+        row["angles"] = cells.angles.detach().tolist()
+    beside = {key: [dict(one) for one in getattr(cells, key)] for key in _BESIDE}
+    return row | {key: elements for key, elements in beside.items() if elements}
 
 
 def with_tables(prescription: Any, folder: str | Path = "") -> Any:
@@ -196,12 +227,15 @@ def with_tables(prescription: Any, folder: str | Path = "") -> Any:
 
 def cell_rows(table: CellTable) -> list[list[Any]]:
     """Return the rows that `cell_table` reads back as the same table, to the last bit."""
-    rows: list[list[Any]] = [["width_nm", "wavelength_nm", "phase_rad", "amplitude"]]
-    for wave, phases, amplitudes in zip(
-        table.wavelengths.tolist(), table.phase.tolist(), table.amplitude.tolist(), strict=True
-    ):
-        each = zip(table.widths.tolist(), phases, amplitudes, strict=True)
-        rows += [[width, wave, phase, passed] for width, phase, passed in each]
+    names = ["width_nm", "wavelength_nm", "phase_rad", "amplitude"]
+    held = [table.phase, table.amplitude]
+    if table.along_y is not None:
+        names += ["phase_y_rad", "amplitude_y"]
+        held += [table.along_y.phase, table.along_y.amplitude]
+    rows: list[list[Any]] = [names]
+    for wave, *numbers in zip(table.wavelengths.tolist(), *(n.tolist() for n in held), strict=True):
+        each = zip(table.widths.tolist(), *numbers, strict=True)
+        rows += [[width, wave, *passed] for width, *passed in each]
     return rows
 
 
@@ -215,7 +249,8 @@ def cell_widths(
 ) -> Tensor:
     """Return the widths whose light is nearest to a wanted phase, in complex amplitude.
 
-    Of each cell it is the width of the least |t - exp(iφ)|, φ being the phase at its centre.
+    Of each cell it is the width of the least |t - exp(iφ)|, φ being the phase at its centre; where
+    a table tells polarisations apart, of the least mean square of both.
 
     Args:
         table: of the cells.
@@ -261,10 +296,12 @@ def _widths_of(
     columns, rows = across[None].expand(len(down), -1), down[:, None].expand(-1, len(across))
     with torch.no_grad():
         wanted = law.phase_and_gradient(parameters, columns, rows)[0]
-        passed = table.transmission(tried, wavelength)
+        both = [t.transmission(tried, wavelength) for t in (table, table.along_y) if t is not None]
+        passed = torch.stack(both).mean(0)
+        power = torch.stack(both).abs().square().mean(0)
         turns = torch.arange(_PHASES, dtype=torch.float64) * (2.0 * math.pi / _PHASES)
         # |t - e^{iφ}|² = |t|² + 1 - 2·Re(t·e^{-iφ}).
         along = passed.real[:, None] * turns.cos() + passed.imag[:, None] * turns.sin()
-        best = tried[(passed.abs().square()[:, None] - 2.0 * along).argmin(0)]
+        best = tried[(power[:, None] - 2.0 * along).argmin(0)]
         found = best[(wanted * (_PHASES / (2.0 * math.pi))).round().long() % _PHASES]
     return found[0] if rings else found

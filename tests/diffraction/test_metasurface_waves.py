@@ -218,7 +218,7 @@ def test_rays_see_the_phase_of_a_metalens_and_nothing_of_its_cells():
         (lambda lens: lens.with_values({CELLS: torch.full((9, 9), 59.0)})
          .psf(fields=[0]), "surface 2: widths of 59 nm; the table of cells holds 60 to 230 nm"),
         (lambda lens: order_efficiencies(lens, [1]), "surface 2 has cells, which have no orders"),
-        (lambda lens: lens.polarisation(), "surface 2 has cells, whose table"),
+        (lambda lens: lens.polarisation(), "surface 2 has cells, whose light goes as waves"),
     ],
 )  # fmt: skip
 def test_what_a_table_does_not_hold_is_refused_in_one_line(ask, said):

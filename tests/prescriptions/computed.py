@@ -116,7 +116,12 @@ def _reliefs(lens: Lens) -> list[Tensor]:
     for number in system.diffractive:
         relief = system.surfaces[number - 1].relief
         if isinstance(relief, Cells):
-            found += [torch.view_as_real(relief.transmission(at, at, w)) for w in (500.0, 600.0)]
+            for wave in (500.0, 600.0):
+                for weight, part in relief.parts:
+                    passed = part.transmission(at, at, wave)
+                    # A phase of all of it makes no irradiance.
+                    passed = passed * torch.sgn(passed.sum()).conj()
+                    found.append(weight * torch.view_as_real(passed))
             continue
         media = system.materials[number - 1], system.materials[number]
         for wave in (500.0, 600.0):

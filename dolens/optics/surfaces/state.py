@@ -68,8 +68,8 @@ class SurfaceState:
             law = replace(law, parameters={n: p.double() for n, p in law.parameters.items()})
         parameters = {n: p.double() for n, p in self.parameters.items()}
         relief = self.relief
-        if relief is not None and relief.values is not None:
-            relief = relief.with_values(relief.values.double())
+        if relief is not None:
+            relief = relief.with_values([value.double() for value in relief.values])
         return replace(self, parameters=parameters, deflection=law, relief=relief)
 
     def sag_and_slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
