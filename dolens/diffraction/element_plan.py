@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from dolens.diffraction.free_space import Layer, reduced_distance
+from dolens.diffraction.free_space import Layer, fourier_error, reduced_distance
 from dolens.diffraction.pupil_fit import PupilFit, chebyshev
 from dolens.diffraction.wavefront import MM_PER_NM
 from dolens.errors import InputError
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 # Cells to a turn of the phase, to a ring or zone, by the settings' `oversampling` of two; fewest
 # and most cells along a side.
 _TWO, _FEWEST, _MOST = 2.0, 96, 4096
+# One Fourier transform serves where it needs so much coarser cells, and errs by no more than this
+# part of the settings' phase error.
+_COARSER, _SHARE = 4.0, 0.3
+# It takes so many more cells to a zone or ring, whose edges are then few of the cells.
+_FINER = 6.0
 # Points that say how steep phases are, and cells that find the light's edge, along each side.
 _COARSE, _SEARCH = 33, 128
 
@@ -31,7 +36,7 @@ class Plan:
     """How the light of one point is computed.
 
     Attributes:
-        method: `spectrum` or `direct`.
+        method: `spectrum`, `fourier` or `direct`.
         cell: mm, of the grid on the element.
         count: cells along each side.
         start: mm, x and y where the grid begins.
@@ -70,37 +75,48 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     fit, relief, settings = light.fit, light.relief, light.settings
     low, high = lit_box(light, n)
     wavelength, layers = float(fit.wavefront.wavelength[n]), light.layers(n)
-    wave = MM_PER_NM * wavelength
+    wave, centre = MM_PER_NM * wavelength, light.centre[n].tolist()
     x, y = coarse(low, high)
-    method = "spectrum" if settings.method == "auto" else settings.method
-    if method == "fourier":
-        raise InputError(
-            "method fourier is not that of light behind a diffractive element; allowed: auto, "
-            "spectrum, direct"
-        )
-    if method != "spectrum" and len(layers) > 1:
+    method = settings.method
+    if method not in ("auto", "spectrum") and len(layers) > 1:
         raise InputError(f"method {method}: there are plates behind; allowed: spectrum")
     slopes = torch.stack(slopes_at(fit, n, x, y))
     behind, lit = turned_slopes(light, n, x, y)
-    carrier = slopes[:, lit].mean(-1)
-    left, turned = behind - carrier[:, None, None], behind - slopes
+    carrier, turned = slopes[:, lit].mean(-1), behind - slopes
     if light.law is not None and isinstance(relief, Relief):
         turned = turned / round(float(light.law.parameters["order"]))
-    steepest = float(torch.where(lit, torch.maximum(left.abs(), turned.abs()), 0.0).max())
     width = float((high - low).max())
     cells = _TWO * settings.oversampling
-    finest = min(wave / (cells * max(steepest, 1e-12)), width / (settings.samples or _FEWEST))
-    cell = finest
-    if relief.values:
+
+    def cell_of(left: Tensor, window: float = 0.0, zones: float = 1.0) -> float:
+        steeper = torch.maximum(left.abs(), zones * turned.abs())
+        steepest = max(float(torch.where(lit, steeper, 0.0).max()), window, 1e-12)
+        finest = min(wave / (cells * steepest), width / (settings.samples or _FEWEST))
+        if not relief.values:
+            return finest
         # Of finer rings than a wavelength light sees the mean.
-        rings = max(relief.pitch / cells, min(relief.pitch, 0.5 * wave))
+        rings = max(relief.pitch / (zones * cells), min(relief.pitch, 0.5 * wave))
         own = relief.pitch if relief.pixelated else rings
-        cell = own / max(1, math.ceil(own / finest - 1e-9))
+        return own / max(1, math.ceil(own / finest - 1e-9))
+
+    cell = cell_of(behind - carrier[:, None, None])
+    if method in ("auto", "fourier") and len(layers) == 1:
+        # What is left of light that meets in the centre; copies of the window stay away.
+        towards = towards_centre(x, y, centre, layers)
+        aside = half_window / float(reduced_distance(layers))
+        coarser = cell_of(behind - towards, aside, _FINER)
+        error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
+        many = coarser > _COARSER * cell or width / cell + 2.0 > _MOST
+        holds = many and error <= _SHARE * settings.phase_error
+        method = "fourier" if method == "auto" and holds else method
+        cell = coarser if method == "fourier" else cell
+    method = "spectrum" if method == "auto" else method
     count = math.ceil(width / cell) + 2
     if count > _MOST:
         raise InputError(
             f"diffractive element: {count} cells of {1e3 * cell:.3g} µm across the light are "
-            f"needed, more than {_MOST}; a slower beam or larger pixels need fewer"
+            f"needed, more than {_MOST}; a slower beam, larger pixels or a smaller window need "
+            "fewer"
         )
     starts = []
     for axis in (0, 1):

@@ -31,10 +31,12 @@ from dolens.diffraction.entrance_beam import ObjectPoints
 from dolens.diffraction.free_space import (
     Layer,
     PlaneField,
+    by_fourier,
     by_spectrum,
     by_summation,
     on_grid,
     reduced_distance,
+    turns_to_centre,
 )
 from dolens.diffraction.propagation import DiffractionSettings, phasor
 from dolens.diffraction.pupil_fit import (
@@ -185,6 +187,8 @@ class ElementLight:
         wavelength = float(self.fit.wavefront.wavelength[n])
         values, x, y = self.behind(n, plan, dtype)
         found = PlaneField(values, x, y, wavelength, plan.carrier)
+        if plan.method == "fourier":
+            return by_fourier(found, layers[0], centre, u, v)
         if plan.method == "spectrum":
             return by_spectrum(found, layers, centre, u, v)
         rows, columns = torch.meshgrid(v + centre[1], u + centre[0], indexing="ij")
@@ -244,15 +248,21 @@ class ElementLight:
     def behind(self, n: int, plan: Plan, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Return the field behind the element, (Y, X), and its columns x and rows y, mm.
 
-        The phase is less the carrier's tilt.  Arguments as of `field`.
+        The phase is less the carrier's tilt, or for the method `fourier` less that of light that
+        meets in the window's centre.  Arguments as of `field`.
         """
         relief, layers, centre = self.relief, self.layers(n), self.centre[n].tolist()
         wavelength = float(self.fit.wavefront.wavelength[n])
         wave = MM_PER_NM * wavelength
         steps = (torch.arange(plan.count).to(self.centre) + 0.5) * plan.cell
         x, y = steps + plan.start[0], steps + plan.start[1]
-        pupil = self.pupil(n, plan, plan.carrier, dtype)
+        fourier = plan.method == "fourier"
+        pupil = self.pupil(n, plan, (0.0, 0.0) if fourier else plan.carrier, dtype)
         turns, amplitude = pupil.opd[0], pupil.amplitude[0]
+        if fourier:
+            turns = turns + on_grid(
+                lambda x, y: turns_to_centre(x, y, layers[0], centre, wavelength)[0], x, y, dtype
+            )
 
         def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
             gain = torch.ones((), dtype=torch.float64)

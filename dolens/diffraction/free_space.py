@@ -1,6 +1,6 @@
 """Light goes from one plane to another through plane layers of media, as a scalar wave.
 
-A field U, time going as exp(-iωt), is carried by one of two methods, both of which are the first
+A field U, time going as exp(-iωt), is carried by one of three methods, all of which are the first
 Rayleigh-Sommerfeld integral
 
     U(ρ) = 1/2π·∫ U(x)·(z/r)·(1/r - ikn)·exp(iknr)/r d²x,    r² = |ρ - x|² + z²,
@@ -11,6 +11,11 @@ the field into the window (Matsushima and Shimobaba, Opt. Express 17, 19662, 200
 Matsushima, Opt. Express 18, 18453, 2010), with a smooth edge of the band; the field is padded by
 the window and that edge, and the window has samples of its own, by a matrix Fourier transform.  It
 holds at every distance and angle.
+
+`fourier`: with R the distance from x to the window's centre, r - R is taken as linear in x and in
+the distance from that centre, so that one Fourier transform remains, of the field times
+exp(iknR)·z/R².  A wide beam that meets far away in a small window needs few cells by it;
+`fourier_error` says what it leaves out.
 
 `direct`: the integral itself, in double precision, as the reference.
 """
@@ -298,6 +303,100 @@ def _band(
         first.append(max(low - axis.tilt, -axis.highest))
         last.append(min(high - axis.tilt, axis.highest - axis.step))
     return first, last
+
+
+def by_fourier(
+    field: PlaneField, layer: Layer, centre: Sequence[float], u: Tensor, v: Tensor
+) -> Tensor:
+    """Carry a field to a window by one Fourier transform; arguments as of `by_spectrum`.
+
+    Args:
+        field: see `by_spectrum`; its values are less the phases of `turns_to_centre`, which are
+            those of light that meets in the window's centre.
+        layer: the one layer.
+        centre: of the window, mm.
+        u: see `by_spectrum`.
+        v: likewise.
+    """
+    wave = MM_PER_NM * field.wavelength / layer.index
+    _, distance = turns_to_centre(field.x[None], field.y[:, None], layer, centre, field.wavelength)
+    gain = field.pitch**2 / wave * layer.thickness / distance.square()
+    values = field.values * gain.to(field.values.real)
+    slopes = _mean_slopes(field.x, field.y, layer.thickness, centre)
+    e_u, e_v = (
+        phasor(-w[:, None] * ((at - at.mean()) * slope / wave), values.real.dtype)
+        for w, at, slope in zip((u, v), (field.x, field.y), slopes, strict=True)
+    )
+    return _product(e_v, values, e_u)
+
+
+def turns_to_centre(
+    x: Tensor, y: Tensor, layer: Layer, centre: Sequence[float], wavelength: float
+) -> tuple[Tensor, Tensor]:
+    """Return n·(R - z)/λ, with R the distance of places (mm) to a window's centre, and R in mm."""
+    square = (x - float(centre[0])).square() + (y - float(centre[1])).square()
+    z = layer.thickness.double()
+    distance = (square + z * z).sqrt()
+    # Without the difference of two large numbers.
+    return square / (distance + z) * (layer.index / (MM_PER_NM * wavelength)), distance
+
+
+def _mean_slopes(x: Tensor, y: Tensor, z: Tensor, centre: Sequence[float]) -> list[Tensor]:
+    """Return the rises along x and y, 1/mm, of the cosine towards the centre that leave least.
+
+    The cosine bends as x³, of which 3/4·x leaves least from -1 to 1: the chord to ±√3/2.
+    """
+    away = [float(at.mean()) - float(c) for at, c in zip((x, y), centre, strict=True)]
+    found = []
+    for axis, at in enumerate((x, y)):
+        chord = 0.5 * math.sqrt(3.0) * float(at[-1] - at[0]) / 2.0
+        across, along = away[1 - axis], [away[axis] - chord, away[axis] + chord]
+        first, last = (a / (z.double().square() + a * a + across * across).sqrt() for a in along)
+        found.append((last - first) / (2.0 * chord))
+    return found
+
+
+@torch.no_grad()
+def fourier_error(
+    x: Tensor,
+    y: Tensor,
+    layer: Layer,
+    centre: Sequence[float],
+    half_window: float,
+    wavelength: float,
+) -> float:
+    """Return the largest phase in waves that `by_fourier` errs by, half of its range over a round
+    field.
+
+    Args:
+        x: (X,), mm, of the field's columns; only its ends count.
+        y: (Y,), mm, of its rows.
+        layer: the one layer.
+        centre: of the window, mm.
+        half_window: mm, from its centre to its sides.
+        wavelength: nm, in vacuum.
+    """
+    across, down = (
+        torch.linspace(float(at[0]), float(at[-1]), _COARSE, dtype=torch.float64) for at in (x, y)
+    )
+    z = float(layer.thickness)
+    slopes = _mean_slopes(across, down, layer.thickness, centre)
+    # Light fills a round beam, or a part of one.
+    unit = torch.linspace(-1.0, 1.0, _COARSE, dtype=torch.float64)
+    lit = unit.square()[None] + unit.square()[:, None] <= 1.0
+    dx, dy = (across - float(centre[0]))[None], (down - float(centre[1]))[:, None]
+    distance = (dx * dx + dy * dy + z * z).sqrt()
+    worst = 0.0
+    for a, b in ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1)):
+        u, v = a * half_window, b * half_window
+        exact = (u * u + v * v - 2.0 * (u * dx + v * dy)) / (
+            ((dx - u).square() + (dy - v).square() + z * z).sqrt() + distance
+        )
+        linear = -((across - across.mean()) * (slopes[0] * u))[None]
+        linear = linear - ((down - down.mean()) * (slopes[1] * v))[:, None]
+        left = (exact - linear)[lit]
+        worst = max(worst, 0.5 * float(left.max() - left.min()))
+    return worst * layer.index / (MM_PER_NM * wavelength)
 
 
 def by_summation(

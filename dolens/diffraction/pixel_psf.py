@@ -230,7 +230,7 @@ def _element_propagation(light: ElementLight, window: PixelWindow) -> Propagatio
     plans = [light.plan(n, window.half_width) for n in range(len(light))]
     none = torch.zeros_like(light.fit.residual)
     return Propagation(
-        fourier=torch.zeros(len(plans), dtype=torch.bool),
+        fourier=torch.tensor([plan.method == "fourier" for plan in plans]),
         reasons=tuple(plan.reason for plan in plans),
         fit_residual=light.fit.residual,
         sphere_term=none,

@@ -43,8 +43,7 @@ class DiffractionSettings:
 
     Attributes:
         method: `fourier`, `direct`, or `auto`: Fourier transform where its phases hold; behind a
-            diffractive element `spectrum`, its `auto`, or `direct` (see
-            `dolens.diffraction.free_space`).
+            diffractive element also `spectrum` (see `dolens.diffraction.free_space`).
         phase_error: waves, the largest error of a phase that the Fourier transform may make.
         rays: along each side of the box of rays that the wavefront is fitted to.
         degree: of the fit; None: 10, or 16 where 10 leaves a hundredth of `phase_error`.

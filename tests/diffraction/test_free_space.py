@@ -10,8 +10,11 @@ from dolens.diffraction.field_pupil import fast_length
 from dolens.diffraction.free_space import (
     Layer,
     PlaneField,
+    by_fourier,
     by_spectrum,
     by_summation,
+    fourier_error,
+    turns_to_centre,
 )
 from dolens.diffraction.wavefront import covered
 
@@ -102,6 +105,26 @@ def test_spectra_are_the_integral_within_a_hundredth_of_the_peak(width, focal, a
     x, y = (torch.tensor(p, dtype=torch.float64) for p in zip(*points, strict=True))
     summed = by_summation(field, layer(z), x, y).abs().square()
     np.testing.assert_allclose(summed.numpy(), exact, atol=1e-9 * peak)
+
+
+@pytest.mark.parametrize(("focal", "angle"), [(8.0, 0.0), (8.0, 0.1), (2.0, 0.1)])
+def test_one_fourier_transform_errs_by_no_more_than_it_says(focal, angle):
+    u = grid(9, 0.02)
+    field = lens(256, 0.5, focal, math.sin(angle))
+    centre = (focal * math.tan(angle), 0.0)
+    error = fourier_error(field.x, field.y, layer(focal), centre, 0.01, field.wavelength)
+    turns, _ = turns_to_centre(
+        field.x[None], field.y[:, None], layer(focal), centre, field.wavelength
+    )
+    turns = turns + field.x[None] * (field.carrier[0] / WAVE)
+    left = field.values * torch.polar(torch.ones_like(turns), 2.0 * math.pi * turns)
+    left = PlaneField(left, field.x, field.y, field.wavelength)
+    found = by_fourier(left, layer(focal), centre, u, u).abs().square()
+    points = [(centre[0] + float(a), float(b)) for b in u[::2] for a in u[::2]]
+    exact = np.abs(brute_force(field, focal, points)) ** 2
+    worst = np.abs(found[::2, ::2].flatten().numpy() - exact).max() / exact.max()
+    # A phase error of w waves changes an amplitude of one by 2·sin(πw) at most.
+    assert worst < 2.0 * math.pi * error + 2e-3
 
 
 def test_light_in_a_plate_is_light_of_a_shorter_wavelength():
