@@ -17,6 +17,7 @@ from dolens import Lens, load_lens
 from dolens.files import user_cache_folder
 from dolens.prescriptions import lens_from_prescription
 from tests.browser import chromium, page, run_async
+from tests.call_stack import run_with_room
 
 __all__ = ["chromium", "page", "run_async"]
 
@@ -33,6 +34,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     first = ROOT / "tests", ROOT / "tests/scripts", ROOT / "tests/cli"
     items.sort(key=lambda item: item.path.parent not in first)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
+    return run_with_room(item, nextitem)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -300,8 +300,9 @@ def _widths_of(
         passed = torch.stack(both).mean(0)
         power = torch.stack(both).abs().square().mean(0)
         turns = torch.arange(_PHASES, dtype=torch.float64) * (2.0 * math.pi / _PHASES)
-        # |t - e^{iφ}|² = |t|² + 1 - 2·Re(t·e^{-iφ}).
-        along = passed.real[:, None] * turns.cos() + passed.imag[:, None] * turns.sin()
-        best = tried[(power[:, None] - 2.0 * along).argmin(0)]
+        # |t - e^{iφ}|² = |t|² + 1 - 2·Re(t·e^{-iφ}), of so few phases at once as a cache holds.
+        ways, twice = torch.stack((turns.cos(), turns.sin()), -1), 2.0 * torch.view_as_real(passed)
+        nearest = [torch.addmm(power, some, -twice.mT).argmin(1) for some in ways.split(64)]
+        best = tried[torch.cat(nearest)]
         found = best[(wanted * (_PHASES / (2.0 * math.pi))).round().long() % _PHASES]
     return found[0] if rings else found
