@@ -25,7 +25,7 @@ _TWO, _FEWEST, _MOST = 2.0, 96, 4096
 # One Fourier transform serves where it needs so much coarser cells, and errs by no more than this
 # part of the settings' phase error.
 _COARSER, _SHARE = 4.0, 0.3
-# It takes so many more cells to a zone or ring, whose edges are then few of the cells.
+# It takes so many more cells to a zone, whose edges are then few of the cells.
 _FINER = 6.0
 # Points that say how steep phases are, and cells that find the light's edge, along each side.
 _COARSE, _SEARCH = 33, 128
@@ -95,7 +95,7 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
         if not relief.values:
             return finest
         # Of finer rings than a wavelength light sees the mean.
-        rings = max(relief.pitch / (zones * cells), min(relief.pitch, 0.5 * wave))
+        rings = max(relief.pitch / cells, min(relief.pitch, 0.5 * wave))
         own = relief.pitch if relief.pixelated else rings
         return own / max(1, math.ceil(own / finest - 1e-9))
 
