@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import lru_cache, wraps
+from types import FunctionType
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -58,7 +59,10 @@ class _Contents(pickle.Pickler):
         if isinstance(thing, Tensor):
             numbers = thing.detach().cpu().contiguous().numpy().tobytes()
             return tuple, ((str(thing.dtype), str(thing.device), tuple(thing.shape), numbers),)
-        if is_dataclass(thing) and not isinstance(thing, type):
+        if isinstance(thing, type | FunctionType) and thing.__module__ != "builtins":
+            # Their name says too little: a user may define another class of the same.
+            return tuple, ((thing.__module__, thing.__qualname__, id(thing)),)
+        if is_dataclass(thing):
             return type(thing), tuple(getattr(thing, field.name) for field in fields(thing))
         return NotImplemented
 

@@ -88,6 +88,28 @@ def test_results_serve_calls_with_equal_numbers_and_no_others():
     assert len(made) == 7
 
 
+def test_shapes_of_a_user_s_function_are_told_apart():
+    made = []
+
+    def shape(factor):
+        class Shape:
+            @staticmethod
+            def sag(x):
+                return factor * x
+
+        return Shape
+
+    @kept_by_content(maxsize=8)
+    def sag(of, x):
+        made.append(of)
+        return of.sag(x)
+
+    one, two = shape(2.0), shape(3.0)
+    with torch.no_grad():
+        assert [float(sag(of, torch.tensor(1.0))) for of in (one, two, one)] == [2.0, 3.0, 2.0]
+    assert made == [one, two]
+
+
 def test_what_was_kept_in_inference_serves_training():
     kept = kept_by_content(maxsize=1)(lambda count: torch.ones(count))
     with torch.inference_mode():
