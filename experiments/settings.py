@@ -1,16 +1,21 @@
-"""Settings that several experiments have, checks of their numbers, and resolvers of OmegaConf."""
+"""Settings that several experiments have, checks of their numbers, and resolvers of OmegaConf.
+
+What shares out the jobs of a sweep reads them too, and waits for no PyTorch: lenses and their rays
+are imported where they are used.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError, check_count
-from dolens.optics.dispersion import require_wavelengths
-from dolens.optics.lens import Lens
+
+if TYPE_CHECKING:
+    from dolens.analysis.pupil_quadrature import SpotRays
+    from dolens.optics.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,8 @@ class Spots:
     pupil: PupilRays
 
     def __post_init__(self) -> None:
+        from dolens.optics.dispersion import require_wavelengths
+
         fields = [numbers_of("fields", field, 2) for field in self.fields]
         wavelengths = numbers_of("wavelengths", self.wavelengths)
         for key, given in (("fields", fields), ("wavelengths", wavelengths)):
@@ -56,12 +63,14 @@ class Spots:
         """Return the number of spots."""
         return len(self.fields) * len(self.wavelengths)
 
-    def rays(self, lens: Lens, pupil: PupilRays | None = None) -> SpotRays:
+    def rays(self, lens: "Lens", pupil: PupilRays | None = None) -> "SpotRays":
         """Return the rays through a lens; with a pupil, in its place.
 
         Raises:
             InputError: a number of rings or arms that there is no quadrature for.
         """
+        from dolens.analysis.pupil_quadrature import gaussian_quadrature
+
         pupil = pupil or self.pupil
         return gaussian_quadrature(
             lens,
@@ -126,7 +135,7 @@ def check_finite(key: str, number: Any) -> None:
         raise InputError(f"{key}: {number!r}; allowed: a number")
 
 
-def check_sensor_distance(lens: Lens, key: str) -> None:
+def check_sensor_distance(lens: "Lens", key: str) -> None:
     """Refuse a lens with the sensor in front of its last surface, where no light comes to.
 
     Args:

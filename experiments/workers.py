@@ -1,4 +1,7 @@
-"""Independent tasks run in this process, in its threads, or in processes of a Ray cluster."""
+"""Independent tasks run in this process, in its threads, or in processes of a Ray cluster.
+
+A sweep's processes import this for the cluster alone: PyTorch is imported with the first task.
+"""
 
 import importlib
 import logging
@@ -14,8 +17,6 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from types import ModuleType
 from typing import Any, Protocol
-
-import torch
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.process_settings import environment_variables, set_matmul_precision
@@ -75,6 +76,8 @@ class OwnProcess:
     def _map(
         self, function: Callable[[Any], Any], tasks: Sequence[Any], name: str
     ) -> Iterator[Any]:
+        import torch
+
         def alone(task: Any) -> Any:
             before = torch.get_num_threads()
             torch.set_num_threads(self.threads)
@@ -299,6 +302,8 @@ def _mapped(
         InputError: a task raised it.
         TaskError: a task raised anything else, or no process brought it to its end.
     """
+    import torch
+
     remote = ray.remote(num_cpus=1, max_retries=retries)(_run)
     # In a tuple Ray passes the reference on: a worker fetches the function once, not for each task.
     shared, precision = (ray.put(function),), torch.get_float32_matmul_precision()
@@ -335,6 +340,8 @@ def _mapped(
 
 def _run(shared: tuple[Any], task: Any, precision: str) -> Any:
     """Run a task as every worker does, and as `workers=0` does: in one thread."""
+    import torch
+
     torch.set_num_threads(1)
     set_matmul_precision(precision)
     return _fetched(*shared)(task)

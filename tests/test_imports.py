@@ -19,6 +19,10 @@ import sys
 def loaded(*names):
     return [m for m in sys.modules for name in names if m == name or m.startswith(name + ".")]
 
+# What starts the jobs of a sweep, and its processes, wait for no PyTorch.
+import dolens.experiments.sweeps.launch, dolens.experiments.sweeps.launchers
+assert not loaded("torch"), "torch"
+
 # What shows a lens is imported when it is called.
 import dolens.optics.lens
 above = loaded("dolens.views", "dolens.analysis", "dolens.diffraction", "dolens.plotting")

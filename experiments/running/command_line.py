@@ -19,8 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dolens.errors import InputError, did_you_mean, one_line, readable
 from dolens.experiments.running.catalogue import added_folders, configuration_folders, experiments
 from dolens.files import packaged_configuration, user_cache_folder, write_whole
-from dolens.prescriptions import lens_from_prescription
-from dolens.prescriptions.files import SUFFIXES, read_lens_file
+from dolens.prescriptions.lens_formats import SUFFIXES
 from dolens.prescriptions.plain_values import yaml_of
 
 # A value that begins so is a list, a mapping, a function or quoted: it needs no quotes around it.
@@ -265,6 +264,10 @@ def _means_file(text: str, folders: Sequence[Path]) -> bool:
 
 def _chosen(text: str) -> str:
     """Read a lens file, and return its name among the files of the configuration."""
+    # Without a lens file nothing here needs PyTorch.
+    from dolens.prescriptions import lens_from_prescription
+    from dolens.prescriptions.files import read_lens_file
+
     path = _path(text).absolute()
     prescription, passed_over = read_lens_file(path)
     lens_from_prescription(prescription, where=str(path))

@@ -1,12 +1,13 @@
-"""Threads, precision of matrix products and inherited environment variables of a process."""
+"""Threads, precision of matrix products and inherited environment variables of a process.
+
+PyTorch is imported where it is told: what starts processes needs the variables alone.
+"""
 
 import logging
 import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-
-import torch
 
 from dolens.errors import InputError
 from dolens.threads import allowed_processors
@@ -25,6 +26,8 @@ def set_threads(threads: int | None) -> None:
     Raises:
         InputError: fewer than one.
     """
+    import torch
+
     if threads is not None:
         if threads < 1:
             raise InputError(f"threads: {threads}; allowed: 1 or more, or null")
@@ -50,6 +53,8 @@ def set_matmul_precision(precision: str) -> None:
     Args:
         precision: `highest`, `high` (TensorFloat32) or `medium` (bfloat16).
     """
+    import torch
+
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Please use the new API settings", UserWarning)
         torch.set_float32_matmul_precision(precision)

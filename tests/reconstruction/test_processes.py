@@ -81,7 +81,9 @@ def work(rank, store, results):
 def two(tmp_path_factory):
     """What each of two processes has found."""
     store = tmp_path_factory.mktemp("store") / "file"
-    context = multiprocessing.get_context("spawn")
+    # Both are copies of a process that has imported all this, which takes longer than the work.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["dolens.experiments.camera.training"])
     results = context.Queue()
     started = [context.Process(target=work, args=(rank, store, results)) for rank in range(2)]
     for process in started:
