@@ -4,14 +4,14 @@ A machine without a GPU finds so what would fail on one: operations that mix ten
 devices, NumPy arrays of tensors on the GPU, and generators of random numbers of the other device.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map, tree_map_only
 
 GPU = torch.device("cuda", 0)
 aten = torch.ops.aten
@@ -27,6 +27,26 @@ _MIXING = {
 _DATA = (torch.tensor, torch.as_tensor, torch.asarray)
 
 
+def _each(function: Callable[[Tensor], Any], value: Any) -> Any:
+    """Return what an operation takes or returns, with a function of every tensor in its place.
+
+    PyTorch's own trees know more kinds of containers, and take three times as long.
+    """
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, list | tuple):
+        return type(value)([_each(function, part) for part in value])
+    if isinstance(value, dict):
+        return {key: _each(function, part) for key, part in value.items()}
+    return value
+
+
+@cache
+def _names(func: Any) -> list[str]:
+    """Return the names of an operation's arguments."""
+    return [argument.name for argument in func._schema.arguments]
+
+
 def _run(
     of: Any,
     func: Any,
@@ -36,7 +56,8 @@ def _run(
 ) -> Any:
     """Run an operation by the CPU, and say where its results are: `__torch_dispatch__`."""
     kwargs = dict(kwargs or {})
-    tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
+    tensors: list[Tensor] = []
+    _each(tensors.append, (args, kwargs))
     here = [t for t in tensors if isinstance(t, OnGpu)]
     sized = [t for t in tensors if not isinstance(t, OnGpu) and t.dim() > 0]
     if here and sized and func not in _MIXING:
@@ -44,7 +65,7 @@ def _run(
     if here and func is aten.index.Tensor and not isinstance(args[0], OnGpu):
         raise RuntimeError("indices should be on the CPU, as what they index")
     on_gpu = bool(here)
-    names = [argument.name for argument in func._schema.arguments[: len(args)]]
+    names = _names(func)[: len(args)]
     if "device" in names:  # without its name, as in inference mode
         first = names.index("device")
         args, kwargs = (
@@ -57,7 +78,7 @@ def _run(
     generator = kwargs.get("generator")
     if isinstance(generator, Generator) and (generator.device.type == "cuda") != on_gpu:
         raise RuntimeError(f"Expected a generator of the device of the tensor: {func}")
-    own, named = tree_map(lambda x: x.numbers if isinstance(x, OnGpu) else x, (args, kwargs))
+    own, named = _each(lambda x: x.numbers if isinstance(x, OnGpu) else x, (args, kwargs))
     if torch.Tag.inplace_view in func.tags:
         func(*own, **named)
         with torch._C._DisableTorchDispatch():
@@ -74,7 +95,7 @@ def _run(
         # A conjugate that is not yet taken shows on the CPU's tensor alone.
         return given[id(result)] if id(result) in given else OnGpu(result.resolve_conj())
 
-    return tree_map_only(Tensor, placed, found)
+    return _each(placed, found)
 
 
 class Generator(torch.Generator):
@@ -154,7 +175,7 @@ class _Data(TorchFunctionMode):
             data = args[0].detach() if func is torch.tensor else args[0]
             return data.to(**{k: v for k, v in kwargs.items() if k in ("dtype", "device")})
         if func in _DATA and isinstance(args[0], list | tuple):
-            plain = tree_map(lambda x: x.tolist() if isinstance(x, OnGpu) else x, args[0])
+            plain = _each(lambda x: x.tolist() if isinstance(x, OnGpu) else x, args[0])
             return func(plain, *args[1:], **kwargs)
         return func(*args, **kwargs)
 
