@@ -5,6 +5,8 @@ from dataclasses import replace
 import torch
 
 from dolens.errors import InputError
+from dolens.optics.diffractive import Relief
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 
 
@@ -25,12 +27,13 @@ def element_number(system: OpticalSystem) -> int:
         raise InputError(f"{what}: the stop, surface {system.stop}, stands behind surface {number}")
     if any(element.last >= number for element in system.elements):
         raise InputError(f"{what}: surface {number}, or one behind it, belongs to a moved element")
-    kind = system.surfaces[number - 1].shape.kind
-    if kind not in ("plane", "aperture"):
+    surface = system.surfaces[number - 1]
+    if is_curved(surface) and (surface.deflection or not isinstance(surface.relief, Relief)):
+        kind = surface.shape.kind
         raise InputError(f"{what}: surface {number} is no plane, but a {kind}")
     for at in range(number + 1, len(system.surfaces) + 1):
         surface = system.surfaces[at - 1]
-        if surface.shape.kind not in ("plane", "aperture") or surface.deflection is not None:
+        if is_curved(surface) or surface.deflection is not None:
             raise InputError(
                 f"{what}: surface {at} behind surface {number} is no plane; waves go from an "
                 "element to the sensor through plane plates only (rays' order alone: `phase`)"
@@ -38,8 +41,15 @@ def element_number(system: OpticalSystem) -> int:
     return number
 
 
+def is_curved(surface: SurfaceState) -> bool:
+    """Return whether a surface is no plane."""
+    return surface.shape.kind not in ("plane", "aperture")
+
+
 def cut_at(system: OpticalSystem, number: int) -> OpticalSystem:
-    """Return a lens that ends on one of its surfaces, which refracts and does nothing else."""
+    """Return a lens that ends on one of its surfaces, which refracts and does nothing else, or on
+    the plane that touches it at its vertex.
+    """
     surfaces = [*system.surfaces[: number - 1]]
     surfaces.append(replace(system.surfaces[number - 1], deflection=None, relief=None))
     return replace(

@@ -27,6 +27,10 @@ _TWO, _FEWEST, _MOST = 2.0, 96, 4096
 _COARSER, _SHARE = 4.0, 0.3
 # It takes so many more cells to a zone, whose edges are then few of the cells.
 _FINER = 6.0
+# Waves that light beside the rays of a curved surface may err by over its sag.
+_MOST_BENT = 0.05
+# Cells to a pixel or ring of a curved surface, which are taken where rays cross it.
+_PARTS = 6
 # Points that say how steep phases are, and cells that find the light's edge, along each side.
 _COARSE, _SEARCH = 33, 128
 
@@ -85,6 +89,8 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     carrier, turned = slopes[:, lit].mean(-1), behind - slopes
     if light.law is not None and isinstance(relief, Relief):
         turned = turned / round(float(light.law.parameters["order"]))
+    if light.surface is not None:
+        _require_short_sag(light, n, half_window, (x, y), behind, lit)
     width = float((high - low).max())
     cells = _TWO * settings.oversampling
 
@@ -97,6 +103,7 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
         # Of finer rings than a wavelength light sees the mean.
         rings = max(relief.pitch / cells, min(relief.pitch, 0.5 * wave))
         own = relief.pitch if relief.pixelated else rings
+        own = own if light.surface is None else relief.pitch / _PARTS
         return own / max(1, math.ceil(own / finest - 1e-9))
 
     cell = cell_of(behind - carrier[:, None, None])
@@ -130,6 +137,38 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
     band = min(1.0 / cell, reach / (wave * float(reduced_distance(layers))))
     tilt = float(carrier[0]), float(carrier[1])
     return Plan(method, cell, count, (starts[0], starts[1]), tilt, band)
+
+
+def _require_short_sag(
+    light: "ElementLight",
+    n: int,
+    half_window: float,
+    at: Sequence[Tensor],
+    slopes: Tensor,
+    lit: Tensor,
+) -> None:
+    """Refuse a curved surface whose sag is too long for light beside its rays.
+
+    Over the sag z light goes the way of rays.  In truth a wave at the angle θ, where rays are at
+    θ_r, has gone n·z·(cos θ_r - cos θ) less, which is nearly (p² - p_r²)·z/2n with p = n·sin θ.
+    """
+    layers, (x, y) = light.layers(n), at
+    assert light.surface is not None
+    sag, *_ = light.surface.shape.sag_and_gradient(
+        light.surface.parameters, *torch.broadcast_tensors(x[None], y[:, None])
+    )
+    towards = towards_centre(x, y, light.centre[n].tolist(), layers).norm(dim=0)
+    farthest = towards + half_window / float(reduced_distance(layers))
+    square = torch.maximum(farthest.square(), slopes.square().sum(0))
+    excess = sag.abs() * (square - slopes.square().sum(0)) / (2.0 * layers[0].index)
+    waves = float(torch.where(lit, excess, 0.0).max())
+    waves /= MM_PER_NM * float(light.fit.wavefront.wavelength[n])
+    if waves > _MOST_BENT:
+        raise InputError(
+            f"diffractive element: surface {light.number} is too curved for its waves, which err "
+            f"by {waves:.2g} wavelengths over the sag; allowed: {_MOST_BENT:g} (less with a "
+            "smaller window, or an image nearer to its focus)"
+        )
 
 
 def lit_box(light: "ElementLight", n: int) -> tuple[Tensor, Tensor]:

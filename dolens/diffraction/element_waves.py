@@ -6,6 +6,9 @@ aligned with its pixels, and free space, or plane plates, carry it to the sensor
 `dolens.diffraction.free_space`).  Rays' own order of the element bends nothing here: the relief
 does, into all its orders.
 
+Heights on a curved surface are found where rays cross it on their way to the plane that touches it
+at its vertex, from which waves leave: the light of other orders goes the way of rays over the sag.
+
 A pixel that is one cell of the grid is a small aperture: light that it turns by Δ (in n·sin) has
 the amplitude sinc(Δ·pitch/λ) along each axis, which is taken towards the middle of the window.
 """
@@ -13,13 +16,13 @@ the amplitude sinc(Δ·pitch/λ) along each axis, which is taken towards the mid
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dolens.diffraction.element_cut import cut_at, element_number
+from dolens.diffraction.element_cut import cut_at, element_number, is_curved
 from dolens.diffraction.element_plan import (
     Plan,
     phase_at,
@@ -53,11 +56,13 @@ from dolens.errors import InputError
 from dolens.optics.diffractive import Relief, transmission
 from dolens.optics.metasurface import Cells
 from dolens.optics.surfaces.phase import RadialPhase
-from dolens.optics.surfaces.state import LawState
+from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
 
 # Degree of the polynomials that rays are fitted by.
 _DEGREE = 10
+# Rounds in which rays find where they crossed a curved surface.
+_CROSSINGS = 4
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,7 @@ class ElementLight:
     Attributes:
         fit: of paths and amplitudes, in mm on the element in the place of direction cosines.
         relief: of the element, or its cells.
+        surface: of the element, where it is curved; None: a plane.
         law: of its phase, or None.
         thicknesses: of the media behind the element, to the sensor, mm.
         number: of the surface.
@@ -77,6 +83,7 @@ class ElementLight:
 
     fit: PupilFit
     relief: Relief | Cells
+    surface: SurfaceState | None
     law: LawState | None
     thicknesses: tuple[Tensor, ...]
     number: int
@@ -95,6 +102,7 @@ class ElementLight:
         found = [self.fit.coefficients, *self.thicknesses]
         found += [s.edge for s in clipping if s.edge is not None]
         found += [] if self.law is None else self.law.parameters.values()
+        found += [] if self.surface is None else self.surface.parameters.values()
         return found + list(self.relief.values)
 
     def with_tensors(self, values: Sequence[Tensor]) -> "ElementLight":
@@ -109,13 +117,18 @@ class ElementLight:
         law = self.law
         if law is not None:
             law = replace(law, parameters={name: left.pop(0) for name in law.parameters})
+        surface = self.surface
+        if surface is not None:
+            own = {name: left.pop(0) for name in surface.parameters}
+            surface = replace(surface, parameters=own)
         relief = self.relief.with_values(left)
         fit = replace(
             self.fit,
             coefficients=coefficients,
             wavefront=replace(self.fit.wavefront, clipping=clipping),
         )
-        return replace(self, fit=fit, thicknesses=thicknesses, law=law, relief=relief)
+        found = replace(self, fit=fit, thicknesses=thicknesses, law=law)
+        return replace(found, relief=relief, surface=surface)
 
     def layers(self, n: int) -> list[Layer]:
         """Return the layers between the element and the sensor, at a point's wavelength."""
@@ -207,7 +220,9 @@ class ElementLight:
             half_window: mm, of the square window.
         """
         relief, behind = self.relief, self.layers(n)
-        if relief.pixelated or len(behind) > 1 or not self.system.rotationally_symmetric:
+        if self.surface is not None or relief.pixelated or len(behind) > 1:
+            return False
+        if not self.system.rotationally_symmetric:
             return False
         if bool(self.centre[n].any()) or not (self.law is None or self.law.law is RadialPhase):
             return False
@@ -296,19 +311,53 @@ class ElementLight:
         wavelength = float(self.fit.wavefront.wavelength[n])
         if isinstance(self.relief, Cells):
             return self.relief.transmission(x, y, wavelength, dtype) * phasor(turns, dtype)
-        front, after = self.system.materials[self.number - 1], self.system.materials[self.number]
-        inside, around = self.relief.indices(front, after, wavelength)
+        media = self.system.materials[self.number - 1], self.system.materials[self.number]
+        inside, around = self.relief.indices(*media, wavelength)
 
         def path(x: Tensor, y: Tensor) -> Tensor:
-            slope_x, slope_y = slopes_at(self.fit, n, x, y)
-            square = slope_x.square() + slope_y.square()
+            square = self._along_surface(n, x, y)
             normal = ((index * index - square).clamp(min=1e-6).sqrt() for index in (inside, around))
             return (next(normal) - next(normal)) / wavelength
 
-        phase = None if self.law is None else phase_at(self.law, x, y)
         turns = (turns - turns.detach().round()).to(dtype)
-        given = on_grid(path, x, y, dtype), (front, after), phase, share, turns
+        if self.surface is not None:
+            u, v = (
+                on_grid(partial(self._crossed, n, axis), x, y, torch.float64) for axis in (0, 1)
+            )
+            wide, high = (_wider(at, place) for at, place in ((x, u), (y, v)))
+            passed = transmission(self.relief, wide, high, on_grid(path, wide, high, dtype), media)
+            return _sampled(passed, wide, high, u, v) * phasor(turns, dtype)
+        phase = None if self.law is None else phase_at(self.law, x, y)
+        given = on_grid(path, x, y, dtype), media, phase, share, turns
         return transmission(self.relief, x, y, *given).to(dtype.to_complex())
+
+    def _along_surface(self, n: int, x: Tensor, y: Tensor) -> Tensor:
+        """Return the square of the wavevector over 2π/λ along the surface, (Y, X)."""
+        slope_x, slope_y = slopes_at(self.fit, n, x, y)
+        square = slope_x.square() + slope_y.square()
+        if self.surface is None:
+            return square
+        _, rise_x, rise_y, _ = self.surface.shape.sag_and_gradient(
+            self.surface.parameters, *torch.broadcast_tensors(x, y)
+        )
+        index = self.layers(n)[0].index
+        along = (index**2 - square).clamp(min=1e-6).sqrt() - slope_x * rise_x - slope_y * rise_y
+        return index**2 - along.square() / (1.0 + rise_x.square() + rise_y.square())
+
+    def _crossed(self, n: int, axis: int, x: Tensor, y: Tensor) -> Tensor:
+        """Return x or y (Y, X), mm, where rays that meet the touching plane at places cross the
+        curved surface.
+        """
+        assert self.surface is not None
+        slope_x, slope_y = slopes_at(self.fit, n, x, y)
+        square, index = slope_x.square() + slope_y.square(), self.layers(n)[0].index
+        normal = (index**2 - square).clamp(min=1e-6).sqrt()
+        x, y = torch.broadcast_tensors(x, y)
+        u, v = x, y
+        for _ in range(_CROSSINGS):
+            sag, *_ = self.surface.shape.sag_and_gradient(self.surface.parameters, u, v)
+            u, v = x + sag * slope_x / normal, y + sag * slope_y / normal
+        return (u, v)[axis]
 
     def pupil(
         self, n: int, plan: Plan, carrier: tuple[float, float], dtype: torch.dtype
@@ -342,6 +391,24 @@ class ElementLight:
             ),
             plan.count,
         )
+
+
+def _wider(at: Tensor, places: Tensor) -> Tensor:
+    """Return places of the same spacing, and as many more at both ends as hold others."""
+    step = float((at[-1] - at[0]) / (len(at) - 1))
+    beyond = torch.stack((at[0] - places.amin(), places.amax() - at[-1])).amax()
+    more = max(0, math.ceil(float(beyond.detach()) / step)) + 2
+    return at[0] + (torch.arange(len(at) + 2 * more).to(at) - more) * step
+
+
+def _sampled(values: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Return complex values on columns x and rows y at places u and v (V, U), linear between."""
+    place = torch.stack(
+        [2.0 * (at - c[0]) / (c[-1] - c[0]) - 1.0 for at, c in ((u, x), (v, y))], -1
+    )
+    planes = torch.view_as_real(values).permute(2, 0, 1)[None]
+    found = torch.nn.functional.grid_sample(planes, place[None].to(planes), align_corners=True)
+    return torch.view_as_complex(found[0].permute(1, 2, 0).contiguous())
 
 
 def _added(fields: Iterable[tuple[float, Tensor]]) -> Tensor:
@@ -396,6 +463,7 @@ def element_light(
     return ElementLight(
         fit_pupil(front, _DEGREE),
         surface.relief,
+        surface if is_curved(surface) else None,
         surface.deflection,
         tuple(gaps),
         number,

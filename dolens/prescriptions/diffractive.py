@@ -1,7 +1,7 @@
 """Diffractive elements of a prescription, read and written.
 
-A surface may be a diffractive element.  Its relief makes the surface's `phase`; on a plane it may
-be given by its heights (nm) as well, or be both in sum::
+A surface may be a diffractive element.  Its relief makes the surface's `phase`, or it is given by
+its heights (nm), or on a plane it is both in sum::
 
     '1': {type: plane, ..., phase: {type: radial, norm_radius: 2, p2: -5700},
           diffractive: {design_wavelength: 550, levels: 16}}
@@ -62,10 +62,11 @@ def diffractive_from(
         if TABLE_KEY in row:
             return metasurface_from(row, surface, where, dtype)
         check_keys(row, _KEYS, where)
-        if surface.kind not in ("plane", "aperture") and (arrays := set(_ARRAYS) & set(row)):
+        curved, arrays = surface.kind not in ("plane", "aperture"), set(_ARRAYS) & set(row)
+        if curved and arrays and surface.phase is not None:
             raise InputError(
-                f"a surface of type '{surface.kind}' cannot have '{arrays.pop()}'; allowed on "
-                "it: the 'design_wavelength' of a 'phase' (plane: all)"
+                f"a surface of type '{surface.kind}' has '{arrays.pop()}' or a 'phase', not both "
+                "(plane: both)"
             )
         given = {key: as_number(row[key], f"'{key}'") for key in _NUMBERS if key in row}
         if len([key for key in _ARRAYS if key in row]) > 1:

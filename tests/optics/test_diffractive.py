@@ -202,9 +202,13 @@ def test_what_makes_no_element_is_refused_in_one_line(element, said):
     assert "\n" not in str(error.value)
 
 
-def test_only_planes_have_heights():
-    with pytest.raises(InputError, match="type 'sphere' cannot have 'rings'; allowed on it: the"):
-        lens_from_prescription(prescription({"rings": [1], "pitch": 1}, type="sphere", radius=9))
+def test_a_curved_surface_has_heights_or_the_relief_of_a_phase():
+    curved = {"type": "sphere", "radius": 9.0}
+    heights, phase = {"rings": [1], "pitch": 1}, {"design_wavelength": 550}
+    lens_from_prescription(prescription(heights, **curved))
+    lens_from_prescription(prescription(phase, phase=lens_phase(8, 550, 1), **curved))
+    with pytest.raises(InputError, match="type 'sphere' has 'rings' or a 'phase', not both"):
+        lens_from_prescription(prescription(heights | phase, phase=lens_phase(8, 550, 1), **curved))
 
 
 def test_heights_are_parameters_of_the_lens():
