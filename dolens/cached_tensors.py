@@ -76,9 +76,9 @@ def _digest(*things: Any) -> bytes:
 def kept_by_content(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator for functions of tensors whose results serve later calls with equal ones.
 
-    Arguments are compared bit by bit, by a digest of what they hold: a lens that is built anew
-    from the same numbers is the same.  With gradients, or within a transform of
-    `torch.func`, nothing is kept.  Callers must not change what is returned.
+    Arguments are compared bit by bit, by a digest of what they hold: a lens that is built anew from
+    the same numbers is the same.  With gradients, or within a transform of `torch.func`, nothing is
+    kept.  Callers must not change what is returned.
 
     Args:
         maxsize: how many results are kept, those that were asked for last.
@@ -92,12 +92,11 @@ def kept_by_content(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
             if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
                 return function(*args, **options)
             key = _digest(args, options)
-            found = results.get(key)
+            found = results.pop(key, None)
             if found is None:
                 with to_be_kept():
-                    found = results[key] = function(*args, **options)
-            else:
-                results.move_to_end(key)
+                    found = function(*args, **options)
+            results[key] = found  # the last
             while len(results) > maxsize:
                 results.popitem(last=False)
             return found

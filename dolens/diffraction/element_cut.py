@@ -6,7 +6,6 @@ import torch
 
 from dolens.errors import InputError
 from dolens.optics.diffractive import Relief
-from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, require_plane_sensor, require_refracting
 
 
@@ -28,22 +27,18 @@ def element_number(system: OpticalSystem) -> int:
     if any(element.last >= number for element in system.elements):
         raise InputError(f"{what}: surface {number}, or one behind it, belongs to a moved element")
     surface = system.surfaces[number - 1]
-    if is_curved(surface) and (surface.deflection or not isinstance(surface.relief, Relief)):
+    flat = surface.shape.flat
+    if not flat and (surface.deflection or not isinstance(surface.relief, Relief)):
         kind = surface.shape.kind
         raise InputError(f"{what}: surface {number} is no plane, but a {kind}")
     for at in range(number + 1, len(system.surfaces) + 1):
         surface = system.surfaces[at - 1]
-        if is_curved(surface) or surface.deflection is not None:
+        if not surface.shape.flat or surface.deflection is not None:
             raise InputError(
                 f"{what}: surface {at} behind surface {number} is no plane; waves go from an "
                 "element to the sensor through plane plates only (rays' order alone: `phase`)"
             )
     return number
-
-
-def is_curved(surface: SurfaceState) -> bool:
-    """Return whether a surface is no plane."""
-    return surface.shape.kind not in ("plane", "aperture")
 
 
 def cut_at(system: OpticalSystem, number: int) -> OpticalSystem:

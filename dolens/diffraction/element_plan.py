@@ -103,7 +103,8 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
         # Of finer rings than a wavelength light sees the mean.
         rings = max(relief.pitch / cells, min(relief.pitch, 0.5 * wave))
         own = relief.pitch if relief.pixelated else rings
-        own = own if light.surface is None else relief.pitch / _PARTS
+        if light.surface is not None:
+            own = relief.pitch / _PARTS
         return own / max(1, math.ceil(own / finest - 1e-9))
 
     cell = cell_of(behind - carrier[:, None, None])
@@ -112,10 +113,9 @@ def plan_of(light: "ElementLight", n: int, half_window: float) -> Plan:
         towards = towards_centre(x, y, centre, layers)
         aside = half_window / float(reduced_distance(layers))
         coarser = cell_of(behind - towards, aside, _FINER)
-        error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
-        many = coarser > _COARSER * cell or width / cell + 2.0 > _MOST
-        holds = many and error <= _SHARE * settings.phase_error
-        method = "fourier" if method == "auto" and holds else method
+        if method == "auto" and (coarser > _COARSER * cell or width / cell + 2.0 > _MOST):
+            error = fourier_error(x, y, layers[0], centre, half_window, wavelength)
+            method = "fourier" if error <= _SHARE * settings.phase_error else method
         cell = coarser if method == "fourier" else cell
     method = "spectrum" if method == "auto" else method
     count = math.ceil(width / cell) + 2

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.diffraction.element_cut import cut_at, element_number, is_curved
+from dolens.diffraction.element_cut import cut_at, element_number
 from dolens.diffraction.element_plan import (
     Plan,
     phase_at,
@@ -58,6 +58,7 @@ from dolens.optics.metasurface import Cells
 from dolens.optics.surfaces.phase import RadialPhase
 from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.scene.scene import bilinear
 
 # Degree of the polynomials that rays are fitted by.
 _DEGREE = 10
@@ -170,10 +171,7 @@ class ElementLight:
         """Return fields whose irradiances add up, each with its weight: polarised cells have
         several, and all else has one.
         """
-        if isinstance(self.relief, Relief):
-            return [(1.0, self)]
-        found = self.relief.parts
-        return [(weight, replace(self, relief=relief)) for weight, relief in found]
+        return [(weight, replace(self, relief=part)) for weight, part in self.relief.parts]
 
     def _passed_by_cells(self, n: int, pupil: RegularPupil) -> Tensor:
         """Return the share of the power that cells pass on a pupil's grid; 1 of a relief."""
@@ -276,7 +274,7 @@ class ElementLight:
         turns, amplitude = pupil.opd[0], pupil.amplitude[0]
         if fourier:
             turns = turns + on_grid(
-                lambda x, y: turns_to_centre(x, y, layers[0], centre, wavelength)[0], x, y, dtype
+                lambda x, y: turns_to_centre(x, y, layers[0], centre, wavelength), x, y, dtype
             )
 
         def turned(x: Tensor, y: Tensor, width: float = plan.cell) -> Tensor:
@@ -333,25 +331,29 @@ class ElementLight:
 
     def _along_surface(self, n: int, x: Tensor, y: Tensor) -> Tensor:
         """Return the square of the wavevector over 2π/λ along the surface, (Y, X)."""
-        slope_x, slope_y = slopes_at(self.fit, n, x, y)
-        square = slope_x.square() + slope_y.square()
         if self.surface is None:
-            return square
+            slope_x, slope_y = slopes_at(self.fit, n, x, y)
+            return slope_x.square() + slope_y.square()
+        slope_x, slope_y, normal = self._wavevector(n, x, y)
         _, rise_x, rise_y, _ = self.surface.shape.sag_and_gradient(
             self.surface.parameters, *torch.broadcast_tensors(x, y)
         )
-        index = self.layers(n)[0].index
-        along = (index**2 - square).clamp(min=1e-6).sqrt() - slope_x * rise_x - slope_y * rise_y
-        return index**2 - along.square() / (1.0 + rise_x.square() + rise_y.square())
+        along = normal - slope_x * rise_x - slope_y * rise_y
+        across = along.square() / (1.0 + rise_x.square() + rise_y.square())
+        return self.layers(n)[0].index ** 2 - across
+
+    def _wavevector(self, n: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the wavevector behind the surface over 2π/λ, (Y, X) each, along x, y and z."""
+        slope_x, slope_y = slopes_at(self.fit, n, x, y)
+        square, index = slope_x.square() + slope_y.square(), self.layers(n)[0].index
+        return slope_x, slope_y, (index**2 - square).clamp(min=1e-6).sqrt()
 
     def _crossed(self, n: int, axis: int, x: Tensor, y: Tensor) -> Tensor:
         """Return x or y (Y, X), mm, where rays that meet the touching plane at places cross the
         curved surface.
         """
         assert self.surface is not None
-        slope_x, slope_y = slopes_at(self.fit, n, x, y)
-        square, index = slope_x.square() + slope_y.square(), self.layers(n)[0].index
-        normal = (index**2 - square).clamp(min=1e-6).sqrt()
+        slope_x, slope_y, normal = self._wavevector(n, x, y)
         x, y = torch.broadcast_tensors(x, y)
         u, v = x, y
         for _ in range(_CROSSINGS):
@@ -403,12 +405,10 @@ def _wider(at: Tensor, places: Tensor) -> Tensor:
 
 def _sampled(values: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Return complex values on columns x and rows y at places u and v (V, U), linear between."""
-    place = torch.stack(
-        [2.0 * (at - c[0]) / (c[-1] - c[0]) - 1.0 for at, c in ((u, x), (v, y))], -1
-    )
-    planes = torch.view_as_real(values).permute(2, 0, 1)[None]
-    found = torch.nn.functional.grid_sample(planes, place[None].to(planes), align_corners=True)
-    return torch.view_as_complex(found[0].permute(1, 2, 0).contiguous())
+    planes = torch.view_as_real(values).permute(2, 0, 1)
+    columns, rows = (((at - c[0]) / (c[1] - c[0])).to(planes) for at, c in ((u, x), (v, y)))
+    found = bilinear(planes, rows, columns)
+    return torch.view_as_complex(found.permute(1, 2, 0).contiguous())
 
 
 def _added(fields: Iterable[tuple[float, Tensor]]) -> Tensor:
@@ -463,7 +463,7 @@ def element_light(
     return ElementLight(
         fit_pupil(front, _DEGREE),
         surface.relief,
-        surface if is_curved(surface) else None,
+        None if surface.shape.flat else surface,
         surface.deflection,
         tuple(gaps),
         number,

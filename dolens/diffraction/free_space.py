@@ -318,11 +318,11 @@ def by_fourier(
         u: see `by_spectrum`.
         v: likewise.
     """
-    wave = MM_PER_NM * field.wavelength / layer.index
-    _, distance = turns_to_centre(field.x[None], field.y[:, None], layer, centre, field.wavelength)
-    gain = field.pitch**2 / wave * layer.thickness / distance.square()
+    wave, z = MM_PER_NM * field.wavelength / layer.index, layer.thickness
+    square = _square_to_centre(field.x[None], field.y[:, None], centre)
+    gain = field.pitch**2 / wave * z / (square + z * z)
     values = field.values * gain.to(field.values.real)
-    slopes = _mean_slopes(field.x, field.y, layer.thickness, centre)
+    slopes = _mean_slopes(field.x, field.y, z, centre)
     e_u, e_v = (
         phasor(-w[:, None] * ((at - at.mean()) * slope / wave), values.real.dtype)
         for w, at, slope in zip((u, v), (field.x, field.y), slopes, strict=True)
@@ -332,13 +332,16 @@ def by_fourier(
 
 def turns_to_centre(
     x: Tensor, y: Tensor, layer: Layer, centre: Sequence[float], wavelength: float
-) -> tuple[Tensor, Tensor]:
-    """Return n·(R - z)/λ, with R the distance of places (mm) to a window's centre, and R in mm."""
-    square = (x - float(centre[0])).square() + (y - float(centre[1])).square()
-    z = layer.thickness.double()
-    distance = (square + z * z).sqrt()
+) -> Tensor:
+    """Return n·(R - z)/λ, with R the distance of places (mm) to a window's centre."""
+    square, z = _square_to_centre(x, y, centre), layer.thickness.double()
     # Without the difference of two large numbers.
-    return square / (distance + z) * (layer.index / (MM_PER_NM * wavelength)), distance
+    return square / ((square + z * z).sqrt() + z) * (layer.index / (MM_PER_NM * wavelength))
+
+
+def _square_to_centre(x: Tensor, y: Tensor, centre: Sequence[float]) -> Tensor:
+    """Return the square of the way aside from places to a window's centre, mm²."""
+    return (x - float(centre[0])).square() + (y - float(centre[1])).square()
 
 
 def _mean_slopes(x: Tensor, y: Tensor, z: Tensor, centre: Sequence[float]) -> list[Tensor]:

@@ -92,6 +92,11 @@ class Relief:
         return replace(self, heights=values[0]) if values else self
 
     @property
+    def parts(self) -> list[tuple[float, "Relief"]]:
+        """Return itself alone, of weight one: it passes all polarisations alike (`Cells.parts`)."""
+        return [(1.0, self)]
+
+    @property
     def pixelated(self) -> bool:
         """Return whether heights are of pixels."""
         return self.heights is not None and self.heights.ndim == 2

@@ -63,7 +63,7 @@ def ideal_elements(given: Sequence[Mapping[str, Any]], where: str) -> Tensor:
         InputError: an element that is none of these, or a number that cannot be used.
     """
     found = torch.eye(2, dtype=_COMPLEX)
-    if isinstance(given, Mapping):
+    if not isinstance(given, Sequence) or isinstance(given, str):
         raise InputError(f"{where}: must be a list of elements, not one")
     for number, element in enumerate(given, 1):
         place = f"{where}: element {number}"

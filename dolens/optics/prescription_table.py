@@ -199,8 +199,7 @@ def prescription_table(lens: Any) -> PrescriptionTable:
             continue
         curvature = values.pop("curvature", None)
         conic = values.pop("conic", None)
-        plane = surface.kind in ("plane", "aperture")
-        radius = math.inf if plane else None
+        radius = math.inf if surface.flat else None
         if curvature is not None:
             radius = math.inf if curvature == 0.0 else 1.0 / curvature
         rows.append(

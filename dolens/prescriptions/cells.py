@@ -29,7 +29,6 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_keys
 from dolens.files import decode_text, read_file
-from dolens.optics.jones import ideal_elements
 from dolens.optics.metasurface import Cells, CellTable, Metasurface
 from dolens.optics.surfaces.base import Surface, tensor_of
 from dolens.optics.surfaces.phase import Phase
@@ -153,7 +152,7 @@ def metasurface_from(
         InputError: one line that says what is wrong, and what is allowed.
     """
     check_keys(row, CELL_KEYS, where)
-    if surface.kind not in ("plane", "aperture"):
+    if not surface.flat:
         raise InputError(f"a surface of type '{surface.kind}' cannot have 'cells'; allowed: plane")
     for key in (TABLE_KEY, "pitch"):
         if row.get(key) is None:
@@ -181,8 +180,6 @@ def metasurface_from(
     if angles is not None:
         angles = tensor_of(as_numbers(angles, "'angles'"), "angles", dtype)
     beside: dict[str, Any] = {key: row.get(key) or () for key in _BESIDE}
-    for key, elements in beside.items():
-        ideal_elements(elements, f"'{key}'")
     cells = Cells(table, widths, as_number(pitch, "'pitch'"), angles, **beside)
     found = Metasurface(cells, dtype)
     cells.check([], where)

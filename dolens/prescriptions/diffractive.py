@@ -62,8 +62,8 @@ def diffractive_from(
         if TABLE_KEY in row:
             return metasurface_from(row, surface, where, dtype)
         check_keys(row, _KEYS, where)
-        curved, arrays = surface.kind not in ("plane", "aperture"), set(_ARRAYS) & set(row)
-        if curved and arrays and surface.phase is not None:
+        arrays = set(_ARRAYS) & set(row)
+        if arrays and surface.phase is not None and not surface.flat:
             raise InputError(
                 f"a surface of type '{surface.kind}' has '{arrays.pop()}' or a 'phase', not both "
                 "(plane: both)"

@@ -113,9 +113,7 @@ def test_one_fourier_transform_errs_by_no_more_than_it_says(focal, angle):
     field = lens(256, 0.5, focal, math.sin(angle))
     centre = (focal * math.tan(angle), 0.0)
     error = fourier_error(field.x, field.y, layer(focal), centre, 0.01, field.wavelength)
-    turns, _ = turns_to_centre(
-        field.x[None], field.y[:, None], layer(focal), centre, field.wavelength
-    )
+    turns = turns_to_centre(field.x[None], field.y[:, None], layer(focal), centre, field.wavelength)
     turns = turns + field.x[None] * (field.carrier[0] / WAVE)
     left = field.values * torch.polar(torch.ones_like(turns), 2.0 * math.pi * turns)
     left = PlaneField(left, field.x, field.y, field.wavelength)

@@ -212,6 +212,7 @@ def test_polarised_cells_are_written_and_read_to_the_last_bit():
         ({"front": [{"polariser": 0}], "behind": [{"polariser": 90}]},
          "'front', cells and 'behind' together pass no light"),
         ({"front": {"polariser": 0}}, "'front': must be a list of elements, not one"),
+        ({"front": 45}, "'front': must be a list of elements, not one"),
         ({"behind": [{"mirror": 0}]}, "'behind': element 1"),
     ],
 )  # fmt: skip

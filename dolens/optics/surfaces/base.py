@@ -163,7 +163,8 @@ class Surface(nn.Module):
             has none, and the reference traces.
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
-            These three are not inherited, since a subclass may have another sag.
+        flat: whether the sag is zero.  These four are not inherited, since a subclass may have
+            another sag.
         changes_axes: whether this is a coordinate break, which light does not meet.
         law: what deflects light in the place of Snell's law, by the surface's own parameters; see
             `dolens.optics.surfaces.deflection`.
@@ -183,6 +184,7 @@ class Surface(nn.Module):
     curvatures: ClassVar[tuple[str, ...]] = ("curvature",)
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
+    flat: ClassVar[bool] = False
     changes_axes: ClassVar[bool] = False
     law: ClassVar["type[Law] | None"] = None
     phase: "Phase | None"
@@ -196,6 +198,7 @@ class Surface(nn.Module):
         cls.kernel = cls.__dict__.get("kernel", shape and SurfaceKernel(shape=shape))
         cls.rotational = cls.__dict__.get("rotational", False)
         cls.closed_form = cls.__dict__.get("closed_form", False)
+        cls.flat = cls.__dict__.get("flat", False)
 
     def __init__(
         self,

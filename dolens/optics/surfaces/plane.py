@@ -18,6 +18,7 @@ class Plane(Surface):
     """The surface is flat, refracts, and has no parameters."""
 
     kind = "plane"
+    flat = True
     kernel = SurfaceKernel(kind=Kind.PLANE)
     rotational = True
     closed_form = True
@@ -80,6 +81,7 @@ class Aperture(Plane):
     """
 
     kind = "aperture"
+    flat = True
     kernel = Plane.kernel
     rotational = True
     closed_form = True
